@@ -12,7 +12,7 @@ from typer import Option
 from lgrasp.choices import FormatName, MetricName
 from lgrasp.words import number, plural
 from lgrasp_cli.names import one_of
-from lgrasp_cli.options import Quiet, Shards, old_name, split, warn
+from lgrasp_cli.options import Quiet, Shards, Where, old_name, split, warn
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, following, place, reporting, took
 from lgrasp_cli.training import normalisation, split_rows
 from lgrasp_cli.working import How, working
@@ -265,12 +265,7 @@ def export(
     to: Annotated[str, Option(**one_of(FormatName, "FORMAT", "Format to write."))],
     out: Annotated[Path, Option("--out", "-o", help="Folder to write; it must be empty or not exist yet.")],
     limit: Annotated[int | None, Option(help="Export at most so many grasps.")] = None,
-    where: Annotated[
-        list[str] | None,
-        Option(
-            help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable."
-        ),
-    ] = None,
+    where: Where = None,
     only_holding: Annotated[
         bool, Option("--only-holding", help="Only grasps that held in simulation; same as --where physics/fc_holds.")
     ] = False,

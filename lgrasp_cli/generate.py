@@ -5,11 +5,11 @@ from typing import Annotated, Any
 
 from typer import Option
 
-from lgrasp.choices import ProtocolName, ScoreName
+from lgrasp.choices import ScoreName
 from lgrasp.words import plural
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import HANDS, OBJECTS, one_of
-from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, choose_pipeline, given
+from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, Simulate, choose_pipeline, given
 from lgrasp_cli.steer import Above, Approach, Avoid, Fingers, GraspType, Links, Palm, PoseFile, Thumb, Touch
 from lgrasp_cli.tables import Block, closed, counted, following, held, place, took
 from lgrasp_cli.working import How, working
@@ -51,10 +51,7 @@ def generate(
     contacts: Contacts = None,
     scale: Scale = 1.0,
     batch: Annotated[int, Option(min=0, help="Candidates per batch; 0: as suits the device.")] = 0,
-    simulate: Annotated[
-        str | None,
-        Option(**one_of(ProtocolName, "PROTOCOL", "Keep only rows that hold in a simulation.")),
-    ] = None,
+    simulate: Simulate = None,
     shard_rows: Annotated[
         int, Option(help="Grasps per shard. Changing it changes which grasps are generated.")
     ] = 10_000,

@@ -8,7 +8,7 @@ from typer import Argument, Option, echo
 
 from lgrasp.words import plural
 from lgrasp_cli.names import HAND_OR_OBJECT
-from lgrasp_cli.options import CacheDir, HandArgument, Quiet, Shards, open_cache
+from lgrasp_cli.options import CacheDir, HandArgument, Quiet, Shards, Where, open_cache
 from lgrasp_cli.tables import Answer, reporting
 
 if TYPE_CHECKING:
@@ -83,12 +83,7 @@ def view(
         list[str], Argument(help="Shards or folders of them; or one scene, hand or object.", **HAND_OR_OBJECT)
     ],
     row: Annotated[int, Option(min=0, help="First row to show, counted through all shards.")] = 0,
-    where: Annotated[
-        list[str] | None,
-        Option(
-            help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable."
-        ),
-    ] = None,
+    where: Where = None,
     host: Host = "localhost",
     port: Port = 8080,
     cache_dir: CacheDir = None,

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 from typer import Argument, Option
 
-from lgrasp_cli.names import DEVICE, HAND, OBJECT, PIPELINE
+from lgrasp.choices import ProtocolName
+from lgrasp_cli.names import DEVICE, HAND, OBJECT, PIPELINE, one_of
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
@@ -42,6 +43,14 @@ Viewpoint = Annotated[
     str | None, Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
 ]
 DryRun = Annotated[bool, Option("--dry-run", help="Show what would be computed, and compute nothing.")]
+Simulate = Annotated[
+    str | None, Option(**one_of(ProtocolName, "PROTOCOL", "Keep only rows that hold in a simulation."))
+]
+Where = Annotated[
+    list[str] | None,
+    Option(help="Only rows that meet a condition: a column, or COLUMN OP NUMBER, such as objects == 1; repeatable."),
+]
+Copies = Annotated[Path | None, Option(help="Write copies into this folder; by default verdicts go into the shards.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress and no report, only warnings and errors.")]
 
 

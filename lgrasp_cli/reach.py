@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from typer import Option
 
-from lgrasp_cli.options import Shards
+from lgrasp_cli.options import Copies, Shards
 from lgrasp_cli.tables import Block, TextTable, following, place, share, took
 from lgrasp_cli.working import How, working
 
@@ -28,9 +28,7 @@ def reach(
     ] = None,
     tip: Annotated[str | None, Option(metavar="LINK", help="Link that carries the hand; default: the last.")] = None,
     tries: Annotated[int | None, Option(min=1, help="Starting postures per pose.")] = None,
-    out: Annotated[
-        Path | None, Option(help="Write copies into this folder; by default verdicts go into the shards.")
-    ] = None,
+    out: Copies = None,
 ) -> None:
     """Find which grasps an arm can make, and add its joints to the shards, as columns physics/reach_...
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option
 
-from lgrasp.choices import Method, Policy, ProtocolName
+from lgrasp.choices import Method, Policy
 from lgrasp_cli.names import HAND, NETWORK, OBJECT, PIPELINE, one_of
-from lgrasp_cli.options import Hand, Seed, Settings, Viewpoint, choose_pipeline, given, position
+from lgrasp_cli.options import Hand, Seed, Settings, Simulate, Viewpoint, choose_pipeline, given, position
 from lgrasp_cli.tables import Block, TextTable, counted, following, held, place, share, took
 from lgrasp_cli.working import How, working
 
@@ -22,9 +22,6 @@ PolicyName = Annotated[
     str | None, Option(**one_of(Policy, "POLICY", "How opposition spaces are chosen; default: the pipeline's."))
 ]
 Size = Annotated[str, Option(help="Factor to metres, or range of the longest side in metres such as 0.06:0.10.")]
-Simulate = Annotated[
-    str | None, Option(**one_of(ProtocolName, "PROTOCOL", "Keep only rows that hold in a simulation."))
-]
 PipelineName = Annotated[
     str, Option("--pipeline", "-p", help="Name of a sequence pipeline, or a YAML file.", **PIPELINE)
 ]

@@ -1,6 +1,5 @@
 """``lgrasp simulate``: does each grasp hold its object in a physics simulation?"""
 
-from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Option
@@ -8,7 +7,7 @@ from typer import Option
 from lgrasp.choices import EngineName, ProtocolName
 from lgrasp.words import number
 from lgrasp_cli.names import one_of
-from lgrasp_cli.options import Shards
+from lgrasp_cli.options import Copies, Shards
 from lgrasp_cli.tables import Block, TextTable, following, place, share, took
 from lgrasp_cli.working import How, working
 
@@ -21,9 +20,7 @@ def simulate(
         str, Option("--protocol", "-p", **one_of(ProtocolName, "PROTOCOL", "What a grasp must withstand."))
     ] = "fc",
     engine: Annotated[str | None, Option(**one_of(EngineName, "ENGINE", "Simulator; default mujoco."))] = None,
-    out: Annotated[
-        Path | None, Option(help="Write copies into this folder; by default verdicts go into the shards.")
-    ] = None,
+    out: Copies = None,
     all_directions: Annotated[
         bool, Option("--all-directions", help="Continue after the first direction in which an object is lost.")
     ] = False,

@@ -111,6 +111,12 @@ def survivors(counts: Counts) -> dict[str, int]:
     }
 
 
+def last_survivors(counts: Counts) -> int:
+    """Grasps that came through the last of the stages that leave some out."""
+    left = survivors(counts)
+    return next((left[stage] for stage in ("simulate", "hold", "filter") if stage in left), 0)
+
+
 def stage_counts(statistics: Mapping[str, Any]) -> Counts:
     """Counts by stage from the statistics of a shard (``STAGE_NAME``)."""
     counts: Counts = {}

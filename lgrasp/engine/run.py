@@ -59,9 +59,9 @@ class Job(Request, ABC):
         return str(self.folder)
 
     @property
-    @abstractmethod
     def folder(self) -> Path:
         """Where the files go."""
+        return self.values()["out"]
 
     @abstractmethod
     def key(self) -> str:

@@ -4,7 +4,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -35,10 +34,6 @@ class ExportJob(ExportRequest, Job):
     command: ClassVar[str] = "export"
     part: ClassVar[str] = "export"
     kernels: ClassVar[tuple[str, ...]] = ()
-
-    @property
-    def folder(self) -> Path:
-        return self.out
 
     def key(self) -> str:
         where = [parse_condition(text) for text in self.where]

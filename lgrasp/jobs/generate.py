@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from pydantic import PrivateAttr, model_validator
 
-from lgrasp.dataset.info import survivors
+from lgrasp.dataset.info import last_survivors, survivors
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.bank import Bank
@@ -138,9 +138,7 @@ class GenerateJob(GenerateRequest, SearchJob):
         )
         if self._writers is None and self.writers() > 1:  # the first part is made alone
             self._writers = ProcessPool(self.writers())
-        last = ("simulate", "held"), ("hold", "held"), ("filter", "kept")
-        kept = next(result.counts[stage][count] for stage, count in last if stage in result.counts)
-        self._rate = max(kept / result.candidates, 1e-3)
+        self._rate = max(last_survivors(result.counts) / result.candidates, 1e-3)
         # poses and contacts go from the internal to the user's frame of the object
         tree, center = self.inputs.hand.model.tree, self.inputs.object.model.center
         grasps, told = result.grasps, {"candidates": result.candidates}

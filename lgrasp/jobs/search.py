@@ -34,10 +34,6 @@ class SearchJob(SearchRequest, Job):
     _meshes: dict[str, bytes] = PrivateAttr(default_factory=dict)
 
     @property
-    def folder(self) -> Path:
-        return self.out
-
-    @property
     @abstractmethod
     def object_name(self) -> str:
         """What is grasped, in the names of files."""

@@ -65,13 +65,13 @@ def _layers(a: int, b: int, c: int, d: int) -> nn.Sequential:
 
 
 @torch.no_grad()
-def best_answers(net: CoarseNet, points: torch.Tensor, normals: torch.Tensor, count: int, seed: int = 0) -> Coarse:
+def best_answers(net: CoarseNet, points: torch.Tensor, normals: torch.Tensor, count: int) -> Coarse:
     """The ``count`` answers with the highest score for one cloud, best first, in its frame.
 
     Args:
         points: any number of points [m], (n, 3); some are drawn. normals: unit, outward, (n, 3).
     """
-    draw = torch.Generator().manual_seed(seed)
+    draw = torch.Generator().manual_seed(0)
     kept = torch.randperm(len(points), generator=draw)[: net.points]
     kept = kept.repeat(-(-net.points // len(kept)))[: net.points].to(points.device)
     n = len(kept)

@@ -10,7 +10,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.learn.examples import Examples
 from lgrasp.learn.network import Coarse, CoarseNet, best_answers
 from lgrasp.learn.params import LearnParams
-from lgrasp.refine.params import LocalSearch
 from lgrasp.refine.refiner import Pose, Refiner
 
 ANSWERS = 4
@@ -56,11 +55,10 @@ class Trainer:
         train: Sequence[Examples],
         params: LearnParams,
         *,
-        search: LocalSearch | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
         self.params, self.device = params, torch.device(device)
-        self._hand, self._search, self._train = hand, search, [_moved(e, self.device) for e in train]
+        self._hand, self._train = hand, [_moved(e, self.device) for e in train]
         self._random = torch.Generator().manual_seed(params.seed)
         self._refiners: dict[int, Refiner] = {}
         state = torch.random.get_rng_state()
@@ -112,7 +110,7 @@ class Trainer:
         """The refiner of an object."""
         key = id(examples.model)
         if key not in self._refiners:
-            self._refiners[key] = Refiner(self._hand, examples.model, self._search, device=self.device)
+            self._refiners[key] = Refiner(self._hand, examples.model, device=self.device)
         return self._refiners[key]
 
     @torch.no_grad()

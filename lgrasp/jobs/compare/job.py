@@ -1,7 +1,6 @@
 """Hands compared on objects: a shard of each hand with each object, their numbers, and a page."""
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -38,10 +37,6 @@ class CompareJob(CompareRequest, Job):
 
     _hands: list[ComparedHand] | None = PrivateAttr(None)
     _pairs: list[tuple[ComparedHand, GenerateJob]] | None = PrivateAttr(None)
-
-    @property
-    def folder(self) -> Path:
-        return self.out
 
     @property
     def compared(self) -> list[ComparedHand]:

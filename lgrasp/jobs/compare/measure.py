@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lgrasp.choices import ProtocolName
-from lgrasp.dataset.info import stage_counts, survivors
+from lgrasp.dataset.info import last_survivors, stage_counts
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.write import read_dataset
 from lgrasp.jobs.row_counts import strict_rows
@@ -40,8 +40,7 @@ def measure_cell(path: Path, protocol: ProtocolName | None) -> dict[str, Any]:
     with ShardReader(path, invalid=False) as reader:
         rows, statistics = len(reader), reader.statistics
         strict = strict_rows(reader.column, reader.header.config)
-        counts = survivors(stage_counts(statistics))
-        kept = next((counts[stage] for stage in ("simulate", "hold", "filter") if stage in counts), 0)
+        kept = last_survivors(stage_counts(statistics))
         wanted = ("metrics/epsilon", "metrics/unresisted_load", "metrics/hold_success")
         columns = {name: reader.column(name).astype(float) for name in wanted if rows}
         held = f"physics/{protocol}_holds"

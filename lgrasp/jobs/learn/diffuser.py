@@ -37,10 +37,6 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
     def effort_steps(self) -> int:
         return self.params.steps
 
-    def about_file(self, path: Path) -> dict[str, Any]:
-        _, about = load_diffuser(path)
-        return {"run_key": about.run_key, "report": about.report}
-
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, start = self.params, time.perf_counter()
         found = self._steps()

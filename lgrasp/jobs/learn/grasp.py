@@ -1,8 +1,7 @@
 """Train a one-object predictor on shards: views of objects, a network that completes them, one that draws grasps."""
 
 import time
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -23,7 +22,7 @@ from lgrasp.learn.diffuser.training import StepTrainer
 from lgrasp.learn.grasp.completion import CompletionNet
 from lgrasp.learn.grasp.completion_training import ViewSet, fit_completion
 from lgrasp.learn.grasp.examples import first_steps, grasp_examples
-from lgrasp.learn.grasp.file import KIND, VERSION, Networks, load_networks, predictor_bytes
+from lgrasp.learn.grasp.file import KIND, VERSION, Networks, predictor_bytes
 from lgrasp.learn.grasp.views import draw_views
 
 _LEAST = 64  # grasps to learn from
@@ -37,10 +36,6 @@ class GraspJob(GraspRequest, NetworkJob):
     @property
     def effort_steps(self) -> int:
         return self.params.completion_steps + self.params.steps
-
-    def about_file(self, path: Path) -> dict[str, Any]:
-        found = load_networks(path)
-        return {"run_key": found.run_key, "report": found.report}
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, alias, start = self.params, self.device_used.alias, time.perf_counter()

@@ -40,9 +40,6 @@ class FitJob(NetworkJob):
     def effort_steps(self) -> int:
         return self.params.steps + self.params.joint_steps
 
-    def about_file(self, path: Path) -> dict[str, Any]:
-        return load_predictor(path)[1]
-
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, device = self.params, self.device_used.alias
         hand, train, held_out = read_examples(self.shards, self.hand, p, self.cache, device)

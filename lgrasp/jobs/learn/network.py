@@ -16,6 +16,7 @@ from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import ConfigError
 from lgrasp.files import write_file
 from lgrasp.jobs.requests.shards import FitRequest
+from lgrasp.learn.networks import open_network, read_card
 
 if TYPE_CHECKING:  # torch takes a second to import
     from lgrasp.learn.curve import Curves
@@ -62,14 +63,6 @@ class NetworkJob(FitRequest, FileJob):
     def parts(self) -> list[Part]:
         return [Part(0, self.out, self.effort_steps)]
 
-    @abstractmethod
-    def about_file(self, path: Path) -> dict[str, Any]:
-        """``run_key`` and ``report`` of a file.
-
-        Raises:
-            ConfigError: it is none of this kind.
-        """
-
     def enough(self, count: int, what: str, least: int) -> None:
         """Raises ConfigError if there are too few grasps, or what else is learnt from."""
         if count < least:
@@ -77,10 +70,11 @@ class NetworkJob(FitRequest, FileJob):
             raise ConfigError(f"{shards}: {count} {what}; at least {least} are needed to learn from")
 
     def found(self, part: Part) -> Found:
-        return Found(self.about_file(part.file)["run_key"], part.rows)
+        with open_network(part.file, *self.kind) as (card, _):
+            return Found(card.get("run_key"), part.rows)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
-        return self.about_file(self.out)["report"] | {"out": str(self.out)} if outcome.paths else {}
+        return read_card(self.out)["report"] | {"out": str(self.out)} if outcome.paths else {}
 
 
 def training_report(

@@ -34,10 +34,6 @@ class SceneJob(SceneRequest, Job):
     _stock: Stock | None = PrivateAttr(None)
 
     @property
-    def folder(self) -> Path:
-        return self.out
-
-    @property
     def hand_name(self) -> str:
         """The hand's name: that of the grasps, else of the hand that is asked for."""
         if self.grasps is None:

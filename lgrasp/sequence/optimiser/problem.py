@@ -23,7 +23,6 @@ class Sides:
         hand: HandModel,
         spaces: Sequence[Space],
         *,
-        dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ) -> None:
         ranges = []
@@ -33,8 +32,8 @@ class Sides:
         first, end = np.moveaxis(np.array(ranges), 2, 0)  # each (S, 2)
         self._first = torch.as_tensor(first, dtype=torch.int64, device=device)
         self._count = torch.as_tensor(end - first, dtype=torch.int64, device=device)
-        self._point = torch.as_tensor(hand.contact_points, dtype=dtype, device=device)
-        self._normal = torch.as_tensor(hand.contact_normals, dtype=dtype, device=device)
+        self._point = torch.as_tensor(hand.contact_points, dtype=torch.float32, device=device)
+        self._normal = torch.as_tensor(hand.contact_normals, dtype=torch.float32, device=device)
         self._body = torch.as_tensor(hand.contact_body, dtype=torch.int64, device=device)
 
     def counts(self, space: torch.Tensor) -> torch.Tensor:
