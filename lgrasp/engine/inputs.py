@@ -158,7 +158,7 @@ class Loader:
 
             digest = hand_digest(source.urdf, source.spec) if hands != LISTED else ""
             if hands.sides:
-                from lgrasp.hand.opposition.sided_hand import sided_hand
+                from lgrasp.hand.opposition.spaces import sided_hand
 
                 bare = hands.model_copy(update={"sides": ()})
                 model = self.hand(source, hand_model_key(digest, bare), bare)

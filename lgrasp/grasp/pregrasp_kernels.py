@@ -107,6 +107,13 @@ def try_openings(
     wp.atomic_or(clear_out, i, 1 << t)
 
 
+@wp.func
+def put_opening(i: wp.int32, least: wp.float32, most: wp.float32, packed_out: Packed):
+    """How far touching fingers are opened at least, 0 without any, and any finger at most [rad or m]."""
+    packed_out.closing_travel[i] = most
+    packed_out.pregrasp_opening[i] = wp.where(least == _NOT_TOUCHING, 0.0, least)
+
+
 @wp.kernel
 def open_poses(
     hand: Hand,
@@ -143,8 +150,7 @@ def open_poses(
         most = wp.max(most, moved)
         if at.chosen[s, g] >= 0:
             least = wp.min(least, moved)
-    packed_out.closing_travel[i] = most
-    packed_out.pregrasp_opening[i] = wp.where(least == _NOT_TOUCHING, 0.0, least)
+    put_opening(i, least, most, packed_out)
 
 
 @wp.func
@@ -246,5 +252,4 @@ def open_fingers(
         most = wp.max(most, moved)
         if at.chosen[s, g] >= 0:
             least = wp.min(least, moved)
-    packed_out.closing_travel[i] = most
-    packed_out.pregrasp_opening[i] = wp.where(least == _NOT_TOUCHING, 0.0, least)
+    put_opening(i, least, most, packed_out)

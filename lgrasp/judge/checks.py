@@ -13,8 +13,7 @@ from lgrasp.judge.hand import pose_transforms
 from lgrasp.judge.meshes import PROBES
 from lgrasp.judge.shard import JudgedShard
 from lgrasp.judge.solids import on_links
-from lgrasp.judge.steer import Asked, disobeys
-from lgrasp.judge.table import on_table
+from lgrasp.judge.steer import Asked, disobeys, on_table
 from lgrasp.judge.wrench import ferrari_canny, force_errors, wrench_residual
 
 CHECKS: dict[str, tuple[str, float]] = {

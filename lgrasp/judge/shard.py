@@ -17,8 +17,7 @@ import trimesh
 from lgrasp.judge.bounds import LIMIT_EXCESS, JudgeError
 from lgrasp.judge.collision import POSTURES, JudgedHand, JudgedObject
 from lgrasp.judge.meshes import clean_mesh, load_mesh
-from lgrasp.judge.regions import JudgedRegions
-from lgrasp.judge.steer import Asked, read_asked
+from lgrasp.judge.steer import Asked, JudgedRegions, read_asked
 
 MOST_BYTES = 4 << 30
 """Of one dataset."""

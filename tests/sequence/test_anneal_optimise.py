@@ -15,9 +15,8 @@ from lgrasp.hand.opposition.spaces import hand_spaces, spaces_view
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.runtime.streams import uniforms
-from lgrasp.sequence.optimiser.optimise import Optimised, optimise
+from lgrasp.sequence.optimiser.optimise import Optimised, optimise, start_poses
 from lgrasp.sequence.optimiser.params import OptimiserParams
-from lgrasp.sequence.optimiser.start import start_poses
 
 SHORT = OptimiserParams(
     iterations=200,

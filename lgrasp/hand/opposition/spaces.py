@@ -12,14 +12,16 @@ import numpy as np
 
 from lgrasp.errors import HandError
 from lgrasp.hand.contacts import body_cones, side_points
+from lgrasp.hand.find import HandSource
 from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.params import LinkSide
 from lgrasp.hand.spec import Cone, HandSpec, Surface
 from lgrasp.hand.spec_check import side_links
 from lgrasp.hand.surface import ContactLink, join_surfaces, with_bare_links
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf, read_urdf
-from lgrasp.hand.whole_hand import surface_arrays
+from lgrasp.hand.whole_hand import listed_links, surface_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,3 +159,26 @@ def _outside(surface: Surface) -> tuple[Cone, ...]:
     """Normals that a side's cone leaves out."""
     x, y, z = surface.axis
     return (Cone(axis=(-x, -y, -z), angle=180.0 - surface.angle),) if surface.angle < 180.0 else ()
+
+
+def sided_hand(source: HandSource, model: HandModel, sides: Sequence[LinkSide], device: str) -> HandModel:
+    """The same hand, some of whose links touch with a side and with nothing else.
+
+    Args:
+        source: what ``model`` was built from. device: answers the geometric queries.
+
+    Raises:
+        HandError: a link without surface on its side.
+    """
+    urdf = read_urdf(source.urdf)
+    surfaces = [Surface(links=(side.link,), axis=side.axis, angle=side.angle) for side in sides]
+    found = side_surface(urdf, model.tree, surfaces, device)
+    for side in sides:
+        if side.link not in {entry.link for entry in found}:
+            raise HandError(
+                f"hand '{model.name}': link '{side.link}' has no {side.side} side that an object can reach "
+                f"(hand.sides: normals within {side.angle:g} degrees of {list(side.axis)})"
+            )
+    named = {side.link for side in sides}
+    links = [*(entry for entry in listed_links(model) if entry.link not in named), *found]
+    return replace(model, **surface_arrays(model, urdf, links, device))

@@ -1,27 +1,82 @@
 """Hands compared on objects: a shard of each hand with each object, their numbers, and a page."""
 
-from dataclasses import asdict
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
+from lgrasp.choices import ProtocolName
+from lgrasp.dataset.reader import read_shard
+from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.events import CancelledError, Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.inputs import Loader
 from lgrasp.engine.pipeline import load_pipeline
-from lgrasp.engine.run import Job
+from lgrasp.engine.run import Job, run
+from lgrasp.errors import HandError
+from lgrasp.files import temporary_folder
+from lgrasp.grasp.records import Shard
+from lgrasp.grasp.schema import MADE_FROM
+from lgrasp.hand.digest import hand_digest
+from lgrasp.hand.drafting.vary import write_variant
+from lgrasp.hand.names import all_hands
+from lgrasp.hand.spec import load_spec
 from lgrasp.hand.workspace import WORKSPACE_VERSION, Workspace, measure_workspace
 from lgrasp.hold.params import HoldTest
-from lgrasp.jobs.compare.cell import make_cell
-from lgrasp.jobs.compare.hands import ComparedHand, compared_hands
 from lgrasp.jobs.compare.measure import measure_cell, measure_hand
 from lgrasp.jobs.compare.page import write_page
 from lgrasp.jobs.config import pair_requests
 from lgrasp.jobs.generate import GenerateJob
-from lgrasp.jobs.requests.compare import CompareRequest
+from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.metrics import HOLD, MetricsJob
+from lgrasp.jobs.requests.compare import CompareRequest, Variation
+from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.object.find import all_objects
+from lgrasp.simulate.protocol import find_protocol
+
+_VERSION = 1  # of variants
+
+
+class ComparedHand(NamedTuple):
+    """A hand of a comparison."""
+
+    name: str
+    source: str
+    """As jobs take it: a name or a path."""
+    of: str
+    """Name of the hand that it is, or is a variant of."""
+    variation: Variation | None
+
+
+def compared_hands(names: Sequence[str], variations: Sequence[Variation], cache: Cache) -> list[ComparedHand]:
+    """Each hand followed by its variants, which are written into the cache where they are missing.
+
+    Raises:
+        HandError: there is no such hand, or it cannot be varied so.
+    """
+    found = []
+    for name in all_hands(names):
+        own = hand_source(name).name
+        found.append(ComparedHand(own, name, own, None))
+        found += [_varied(name, variation, cache) for variation in variations]
+    return found
+
+
+def _varied(name: str, variation: Variation, cache: Cache) -> ComparedHand:
+    source = hand_source(name)
+    content = hand_digest(source.urdf, source.spec)
+    key = content_key("variant", _VERSION, content=content, variation=list(variation))
+    label = f"{source.name}-{variation.label}"
+    folder = cache.root / "variants" / key[:32] / label
+    try:
+        load_spec(folder / "hand.yaml")
+    except HandError:  # not written yet, or unreadable
+        write_variant(source, variation.kind, variation.factor, label, folder)
+    return ComparedHand(label, str(folder), source.name, variation)
+
 
 PAGE = "compare.html"
 """File of the page, in the folder of the job."""
@@ -123,3 +178,58 @@ class CompareJob(CompareRequest, Job):
 
         found, _ = self.cache.get("workspace", key, make)
         return Workspace(**{name: float(value) for name, value in found.items()})
+
+
+def make_cell(job: GenerateJob, protocol: ProtocolName | None, key: str, progress: PartProgress) -> Shard:
+    """The grasps of a job with the metrics of the hold test, and with the verdicts of a protocol.
+
+    Args:
+        job: its folder is not used.
+        key: content key that the shard is marked with.
+
+    Raises:
+        CancelledError: the job is to stop.
+        LgraspError: see the jobs.
+    """
+    how = {"device": job.device, "workers": job.workers, "cache": job.cache}
+    told = _Told(progress)
+    with temporary_folder() as folder:
+        _run(job.changed(out=folder / "grasps"), told)
+        told.what = "hold test"
+        tried = MetricsJob(shards=(folder / "grasps",), out=folder / "tried", add=(HOLD,), **how)
+        (path,) = _run(tried, told)
+        if protocol is not None:
+            told.what, how["device"] = protocol, "cpu"
+            simulated = SimulateJob(shards=(path,), protocol=find_protocol(protocol), out=folder / "simulated", **how)
+            (path,) = _run(simulated, told)
+        shard = read_shard(path)
+    return replace(shard, statistics={**shard.statistics, MADE_FROM: key})
+
+
+def _run(job: Job, events: Events) -> Sequence[Path]:
+    outcome = run(job, events)
+    if outcome.cancelled:
+        raise CancelledError
+    return outcome.paths
+
+
+class _Told(Events):
+    """What the part of a comparison tells of the jobs that it runs."""
+
+    def __init__(self, progress: PartProgress) -> None:
+        self._progress, self._kept = progress, 0
+        self.what = ""
+        """Is being done with the rows; none: they are being made."""
+
+    def said(self, words: str) -> None:
+        self._progress.events.said(words)
+
+    def advanced(self, part: Part, done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
+        # the last row is told when the part is on disk: until then it may be stopped
+        last = self._progress.part.rows - 1
+        if not self.what:
+            self._kept = min(kept, last)
+        self._progress(last if self.what else min(done, last), self.what, kept=self._kept)
+
+    def cancelled(self) -> bool:
+        return self._progress.events.cancelled()
