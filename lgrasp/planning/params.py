@@ -4,7 +4,6 @@ from pydantic import Field
 
 from lgrasp.config import Params
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.hold.params import HoldTest
 from lgrasp.refine.params import DISTAL, OTHER, LocalSearch
 
 _CLOUD_GAP = 6.0e-3  # [m]
@@ -59,13 +58,12 @@ class PlanParams(Params):
         default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
     )
     tried: int = Field(
-        default=10,
+        default=3,
         ge=0,
         le=64,
-        description="Hands of each start that are tried, those that resist most first: the one that holds most often "
-        "is the plan. 0: none.",
+        description="Hands of each start that are tried at most, those that resist most first: the first that holds is "
+        "the plan. 0: none.",
     )
-    hold: HoldTest = Field(default=HoldTest(), description="How they are tried.")
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
     def weights(self) -> dict[str, float]:

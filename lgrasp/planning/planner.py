@@ -30,7 +30,8 @@ from lgrasp.refine.surface import farthest_points, hand_surface
 from lgrasp.refine.volume import upload_target
 from lgrasp.runtime.cores import cores
 
-_CPU_STARTS, _GPU_STARTS = 10, 1000  # planned at a time
+_CPU_STARTS = 10  # planned at a time
+_GPU_HANDS = 1 << 16  # searched at a time
 _COLLIDES = 1.0e-3  # [m]
 _COARSE_BOUNDS = {"max_penetration": 0.01, "max_gap": 0.012, "max_normal_angle": 60.0, "max_normal_spread": 90.0}
 
@@ -94,7 +95,8 @@ class Planner:
         points = np.arange(count)
         if self.guesses is None:
             points = farthest_points(self.model.contact_points.astype(float), count)
-        size, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_STARTS, 1)
+        each = self.params.rolls if self.guesses is None else self.params.draws
+        size, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_HANDS // each, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS], 0)
         tables = []
         search = self._scene.search
@@ -124,7 +126,7 @@ class Planner:
         around = None if self.around is None else upload_object(self.around, device)
         target = upload_target(self.model, self.around, device)
         obj, search = upload_object(self.model, device), Descent(self.hand, target, self.params.search, surface)
-        return _Scene(search, obj, around, _tester(self.hand, obj, self.params.hold))
+        return _Scene(search, obj, around, _tester(self.hand, obj))
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
@@ -132,9 +134,9 @@ class Planner:
         start, at = self._opened(search, points, first) if self.guesses is None else self._guessed(points)
         if len(start):
             search.run(at, rounds=p.opening)
-            start, at = self._best(at, start, _loosened(p.bounds), p.finalists)
+            start, at = self._finalists(start, at)
             search.run(at, first=p.opening)
-            start, at = self._best(at, start, p.bounds, 1, tried=p.tried)
+            start, at = self._steadiest(start, at)
         return self._checked(at, start, p.bounds)
 
     def _opened(self, search: Descent, points: np.ndarray, first: int) -> tuple[np.ndarray, Hands]:
@@ -156,29 +158,50 @@ class Planner:
         rows = (starts[:, None] * each + np.arange(each)).reshape(-1)
         return starts.repeat(each), self._put(device_inverse(self.guesses.pose[rows]), self.guesses.q[rows])
 
-    def _best(
-        self, at: Hands, start: np.ndarray, bounds: GraspBounds, count: int, *, tried: int = 0
-    ) -> tuple[np.ndarray, Hands]:
-        """The ``count`` best hands of each start: those that pass the checks first, then, of the ``tried`` best of
-        these, those that hold most often, then those that resist most."""
-        bounds = bounds.changed(friction=self.params.rank_friction)
-        table, outcome = self._checked(at, start, bounds)
-        keys = [np.arange(len(start)), -table.metrics["epsilon"], table.metrics["unresisted_load"]]
-        place = _places(start, [*keys, outcome != Outcome.KEPT])
-        held = self._held(table, np.flatnonzero((outcome == Outcome.KEPT) & (place < tried)))
-        rows = np.flatnonzero(_places(start, [*keys, -held, outcome != Outcome.KEPT]) < count)
+    def _finalists(self, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
+        """The best hands of each start after the first matchings."""
+        p = self.params
+        if np.bincount(start).max() <= p.finalists:
+            return start, at
+        _, place, _ = self._ranked(start, at, _loosened(p.bounds))
+        return self._only(np.flatnonzero(place < p.finalists), start, at)
+
+    def _steadiest(self, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
+        """One hand of each start: of those tried the first that holds, else the one that resists most."""
+        table, place, passed = self._ranked(start, at, self.params.bounds)
+        held = self._held(table, np.where(passed, place, self.params.tried))
+        place = np.where(held, place - len(place), place)
+        best = np.full(start.max() + 1, len(place))
+        np.minimum.at(best, start, place)
+        return self._only(np.flatnonzero(place == best[start]), start, at)
+
+    def _ranked(self, start: np.ndarray, at: Hands, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray, np.ndarray]:
+        """All hands, the place of each among those of its start (those that pass the checks first, then those that
+        resist most), and which pass."""
+        table, outcome = self._checked(at, start, bounds.changed(friction=self.params.rank_friction))
+        passed = outcome == Outcome.KEPT
+        order = np.lexsort([-table.metrics["epsilon"], table.metrics["unresisted_load"], ~passed, start])
+        place = np.empty(len(start), int)
+        place[order] = np.arange(len(start)) - np.searchsorted(start[order], start[order])
+        return table, place, passed
+
+    def _held(self, table: GraspTable, place: np.ndarray) -> np.ndarray:
+        """Which hands hold when they are tried, (M,): of each start those at the first places, until one holds; twice
+        as many at once each time, since few trials keep a GPU as long as many."""
+        held, tester, first = np.zeros(len(place), bool), self._scene.tester, 0
+        while tester is not None and first < self.params.tried:
+            last = min(2 * first + 1, self.params.tried)
+            done = np.isin(table.index, table.index[held])
+            rows = np.flatnonzero((place >= first) & (place < last) & ~done)
+            if not len(rows):
+                break
+            held[rows] = tester.run(ControlPoses.of(take_grasps(table, rows)), 0)["hold_success"] > 0
+            first = last
+        return held
+
+    def _only(self, rows: np.ndarray, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
         pose, q = at.arrays()
         return start[rows], self._put(pose[rows], q[rows])
-
-    def _held(self, table: GraspTable, rows: np.ndarray) -> np.ndarray:
-        """Share of the trials in which each hand of some rows holds, (M,); 0 of the others."""
-        held, tester = np.zeros(len(table.index)), self._scene.tester
-        if tester is None or not len(rows):
-            return held
-        found = tester.run(ControlPoses.of(take_grasps(table, rows)), 0)
-        draws = self.params.hold.draws
-        held[rows] = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
-        return held
 
     def _starts(self, points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Start of each hand (M,), the hands' bases (M, 7) and joints (M, K), and the directions they face (M, 3).
@@ -206,14 +229,6 @@ class Planner:
         return check_grasps(self.hand, obj, back, q, contacts, bounds, around=self._scene.around, index=start)
 
 
-def _places(start: np.ndarray, keys: list[np.ndarray]) -> np.ndarray:
-    """Place of each hand among those of its start (M,), by the last key, then the one before it."""
-    order = np.lexsort([*keys, start])
-    place = np.empty(len(start), int)
-    place[order] = np.arange(len(start)) - np.searchsorted(start[order], start[order])
-    return place
-
-
 @dataclass(frozen=True)
 class _Scene:
     """What a planning uploads once."""
@@ -225,8 +240,8 @@ class _Scene:
     """None: nothing is known of the object but a plane, which has no mass."""
 
 
-def _tester(hand: HandArrays, obj: ObjectArrays, test: HoldTest) -> HoldTester | None:
+def _tester(hand: HandArrays, obj: ObjectArrays) -> HoldTester | None:
     try:
-        return HoldTester(hand, obj, test)
+        return HoldTester(hand, obj, HoldTest(draws=0))
     except ObjectError:
         return None

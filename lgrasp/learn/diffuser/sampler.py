@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -21,6 +22,18 @@ Result = TypeVar("Result")
 
 _TURNS = 64  # rotations in which the network sees an object
 _CPU_ROWS, _GPU_ROWS = 256, 32_768  # at a time
+
+
+@contextmanager
+def _short_products(device: torch.device) -> Iterator[None]:
+    """Matrix products on a GPU round their factors to 11 bits, several times as fast."""
+    before = torch.get_float32_matmul_precision()
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 class DrawnSteps(NamedTuple):
@@ -156,7 +169,8 @@ class StepSampler:
             seen = situation.rows(row)._replace(shape=self._shape(number)[own])
             objects = torch.full_like(row, number), HeldObjects(*(x[row] for x in held))
             given = normals(own_seed, 0, 9 + joints).float(), self._turns[own]
-            R, t, q = draw_steps(self._net, self._process, self._senses, seen, *given, *objects, steps)
+            with _short_products(self._device):
+                R, t, q = draw_steps(self._net, self._process, self._senses, seen, *given, *objects, steps)
             return pose_from_motion(R, t), q
 
         parts = _in_threads(work, _batches(count, self._device), pool if self._device.type == "cpu" else None)

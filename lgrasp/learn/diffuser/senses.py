@@ -119,7 +119,10 @@ class Senses:
     def _places(self, q: torch.Tensor) -> torch.Tensor:
         """The hand's points in the hand frame, (N, P, 3) [m]."""
         R_body, t_body = self._bodies(q)
-        return (R_body[:, self._body] @ self._points[..., None])[..., 0] + t_body[:, self._body]
+        # by columns: as many products of small matrices take several times as long on a GPU
+        x, y, z = R_body[:, self._body].unbind(-1)
+        u, v, w = self._points[..., None].unbind(1)
+        return x * u + y * v + z * w + t_body[:, self._body]
 
     def _from_held(self, places: torch.Tensor, held: HeldObjects) -> torch.Tensor:
         if not held.object.shape[1]:
