@@ -87,9 +87,10 @@ def completed_object(seen: ObjectModel, distance: Callable[[np.ndarray], np.ndar
     inside = coarse[distance(coarse) < 0]
     whole = np.concatenate([points, inside])
     nodes, shape, cell = _lattice(whole.min(0) - _PAD, whole.max(0) + _PAD)
-    value, away = _heights(nodes, points, normals, tree, cell)
-    share = np.clip((_GUESSED - away) / (_GUESSED - _TRUSTED), 0, 1)
-    value = share * value + (1 - share) * distance(nodes)
+    value, away = distance(nodes), tree.query(nodes, distance_upper_bound=_GUESSED, workers=-1)[0]
+    near = away < _GUESSED
+    share = np.clip((_GUESSED - away[near]) / (_GUESSED - _TRUSTED), 0, 1)
+    value[near] = share * _heights(nodes[near], points, normals, tree, cell)[0] + (1 - share) * value[near]
     grid = value.reshape(shape)
     hidden = (np.abs(value) < cell) & (away > _GUESSED)
     slope = np.stack(np.gradient(grid, cell), -1).reshape(-1, 3)[hidden]
