@@ -34,7 +34,8 @@ def searched(swift, inputs):
     """searched(policy, **place): the grasps of the first candidates, contacts drawn twice."""
 
     def searched(policy=None, cut=CANDIDATES, **place):
-        pipeline = swift.with_params("place", policy=policy and str(policy), **place).with_params("domain", rounds=2)
+        pipeline = swift.with_params("place", policy=policy and str(policy), **place)
+        pipeline = pipeline.with_params("domain", rounds=2, later_cost=1.5)
         context = shard_context(pipeline, inputs, 0)
         return [run_batch(pipeline, context, first, cut) for first in range(0, CANDIDATES, cut)]
 
@@ -54,9 +55,16 @@ def test_objects_are_where_the_policy_wants_them(searched, policy):
     assert np.quantile(ahead, 0.3) > np.quantile(behind, 0.3)
 
 
+def test_the_warmer_a_policy_the_less_it_insists(searched, policy):
+    path = policy(x=50.0)
+    x = [searched(path, policy_temperature=t)[0].grasps.pose[:, 0].mean() for t in (0.0, 1.0, 100.0)]
+    assert x[0] > x[1] + 0.004
+    assert x[1] > x[2] + 0.004
+
+
 def test_a_policy_without_weights_changes_nothing(searched, policy):
     (without,) = searched(proposals=5)
-    (rated,) = searched(policy(), policy_proposals=5)
+    (rated,) = searched(policy(), policy_proposals=5, policy_temperature=0.0)
     assert len(without.grasps) > 20
     np.testing.assert_array_equal(rated.grasps.q, without.grasps.q)
     np.testing.assert_array_equal(rated.grasps.pose, without.grasps.pose)

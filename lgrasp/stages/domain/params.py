@@ -19,9 +19,9 @@ class DomainParams(Params):
     )
     enough: int = Field(default=6, ge=1, le=4096, description="Realised contacts of a finger that need no more.")
     later_cost: float = Field(
-        default=1.5,
+        default=0.0,
         ge=0,
         le=100,
         description="Cost of a pose after the first contacts, over that before; with a policy those that are not worth "
-        "it are dropped. 0: none.",
+        "it are dropped, and less is covered. 0: none.",
     )

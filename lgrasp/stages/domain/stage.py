@@ -61,8 +61,8 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
 
 
 def _drop_unlikely(table: CandidateTable, params: DomainParams, context: Context) -> None:
-    """Poses lose their contacts that a policy, if there is one, finds unlikely to give a grasp."""
-    if context.policy is None or context.opposed:
+    """Poses lose their contacts that a policy, if there is one, finds not worth going on with."""
+    if context.policy is None or context.opposed or not params.later_cost:
         return
     n, groups = table.count.shape
     chance = wp.empty(n, dtype=wp.float32, device=context.device)

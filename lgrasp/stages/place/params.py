@@ -47,6 +47,13 @@ class PlaceParams(Params):
     policy_proposals: int = Field(
         default=16, ge=1, le=1024, description="Poses tried per candidate where a policy rates them."
     )
+    policy_temperature: float = Field(
+        default=0.5,
+        ge=0,
+        le=100,
+        description="Of these one is drawn in proportion to its chance to the power of 1 over this; 0: the likeliest. "
+        "More covers more of the ways to hold an object.",
+    )
     table: bool = Field(
         default=False, description="The object rests on a table that grasps leave room for, the way to them included."
     )

@@ -19,8 +19,9 @@ _MAX_GROUP_HITS = wp.constant(6)  # rated contacts per group
 MAX_HITS = wp.constant(48)  # rated contacts of a pose
 _OPPOSED_COSINE = wp.constant(0.766)  # cos 40 deg, of an inward normal to the line between two contacts
 _LEAST_CONTACT_HEIGHT = wp.constant(0.005)  # [m] above the table, of contacts that rate a pose
-_CHANCE_STEPS = wp.constant(2000.0)  # ratings by a policy for one unit of log-odds
-_MOST_CHANCE = wp.constant(16.0)  # log-odds beyond are as good
+_CHANCE_STEPS = wp.constant(2000.0)  # ratings by a policy for one unit of the logarithm of a chance
+_MOST_CHANCE = wp.constant(16.0)  # logarithms beyond are as good
+_LEAST_LUCK = wp.constant(1.0e-6)
 _PAIRS = wp.constant(4096)  # ratings between two of a policy, told apart by opposed pairs
 
 
@@ -151,10 +152,11 @@ def rate_pose(
     state: wp.uint32,
 ):
     """How many pairs of reachable contacts of different groups oppose each other about the centre of mass; where there
-    is a policy, its log-odds come first.
+    is a policy, the logarithm of its chance comes first, and a random number is added.
 
     A pair counts when each contact's inward normal is within 40 degrees of the line to the other, and the line passes
-    the centre of mass within ``max_com_distance``. Arguments as of :func:`find_reach`.
+    the centre of mass within ``max_com_distance``. The highest rating of several by a policy is drawn in
+    proportion to a power of the chances. Arguments as of :func:`find_reach`.
     """
     points = wp.zeros(shape=(MAX_HITS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_HITS,), dtype=wp.vec3)
@@ -185,6 +187,8 @@ def rate_pose(
     pairs = _opposed_pairs(points, normals, owner, m, wp.transform_point(T, obj.com), params.max_com_distance)
     if net.rows.shape[0] == 0 or pairs == 0:
         return pairs
-    chance = chance_of(net, obj, T, points, normals, share, owner, found, palm)
+    luck = wp.clamp(wp.randf(wp.rand_init(wp.randi(state))), _LEAST_LUCK, 1.0 - _LEAST_LUCK)
+    chance = -wp.log(1.0 + wp.exp(-chance_of(net, obj, T, points, normals, share, owner, found, palm)))
+    chance -= params.policy_temperature * wp.log(-wp.log(luck))  # Gumbel's distribution
     steps = int(_CHANCE_STEPS * (wp.clamp(chance, -_MOST_CHANCE, _MOST_CHANCE) + _MOST_CHANCE))
     return steps * _PAIRS + wp.min(pairs, _PAIRS - 1)

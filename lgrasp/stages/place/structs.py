@@ -33,6 +33,7 @@ class PlaceValues:
     pinch: wp.float32
     palm: wp.float32
     samples: wp.int32
+    policy_temperature: wp.float32
     max_com_distance: wp.float32  # [m]
     allowed_penetration: wp.float32  # [m]
     spins: wp.int32
