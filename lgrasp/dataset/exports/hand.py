@@ -1,17 +1,18 @@
 """The hand of a shard outside of it: its URDF with its mesh files, its frames and couplings."""
 
+import io
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+import yourdfpy
 from lxml import etree
 
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse, pose_from_matrix
 from lgrasp.grasp.records import HandRecord
-from lgrasp.hand.links import link_poses
-from lgrasp.hand.urdf import check_robot, parse_robot
+from lgrasp.hand.urdf import parse_robot
 
 
 def hand_files(hand: HandRecord, where: Path) -> dict[str, bytes]:
@@ -71,39 +72,50 @@ class HandFrames:
         where: The file that it is from, for messages.
 
     Raises:
-        ShardError: The URDF lacks the base link or a joint.
-        HandError: The URDF cannot be used.
+        ShardError: The URDF cannot be read, or lacks the base link or a joint.
+        HandError: The URDF is not XML.
     """
 
     def __init__(self, urdf: str, base_link: str | None, joint_names: Sequence[str], where: Path) -> None:
-        robot, text = parse_robot(where, urdf.encode())
+        robot, _ = parse_robot(where, urdf.encode())
         for shape in [*robot.iter("visual", "collision")]:
             shape.getparent().remove(shape)
-        self._urdf = check_robot(where, robot, text)
-        self.root: str = self._urdf.root
+        for limit in robot.iter("limit"):
+            for key in ("effort", "velocity"):
+                limit.set(key, limit.get(key, "0"))
+        try:
+            self._urdf = yourdfpy.URDF.load(io.BytesIO(etree.tostring(robot)))
+        except Exception as error:  # yourdfpy raises many kinds
+            raise ShardError(f"{where}: its URDF is malformed: {type(error).__name__}: {error}") from error
+        self.root: str = self._urdf.base_link
         self.base: str = base_link or self.root
         self.joint_names = tuple(joint_names)
-        joints = {joint.name: joint for joint in self._urdf.joints}
-        if self.base not in self._urdf.links:
+        joints = self._urdf.joint_map
+        if self.base not in self._urdf.link_map:
             raise ShardError(f"{where}: its URDF has no link {self.base!r}, the base link")
         for name in joint_names:
             if name not in joints:
                 raise ShardError(f"{where}: its URDF has no joint {name!r}, a column of q")
         self.mimics: dict[str, tuple[str, float, float]] = {
-            name: joint.mimic for name, joint in joints.items() if joint.mimic and name not in self.joint_names
+            name: (j.mimic.joint, 1.0 if j.mimic.multiplier is None else j.mimic.multiplier, j.mimic.offset or 0.0)
+            for name, j in joints.items()
+            if j.mimic is not None and name not in self.joint_names
         }
         """Joints that are not in q: source joint, multiplier, offset."""
-        self._columns = [i for i, name in enumerate(self.joint_names) if name in self._between()]
+        moving = self._between()
+        self._columns = [i for i, name in enumerate(self.joint_names) if name in moving]
 
     def base_from_root(self, q: np.ndarray) -> np.ndarray:
         """``T_base_root``: poses [n, 7] of the URDF's root link in the base link's frame; q is [n, K].
 
         Only joints held at a value can lie between the two, so that it is the same for all rows of a shard as a rule.
         """
+        if not self._columns:
+            return np.repeat(pose_from_matrix(self._transform({})), len(q), axis=0)
         settings, which = np.unique(q[:, self._columns], axis=0, return_inverse=True)
         names = [self.joint_names[i] for i in self._columns]
-        poses = link_poses(self._urdf, self.base, dict(zip(names, settings.T, strict=True)))
-        return pose_from_matrix(poses[self.root])[which.ravel()]
+        transforms = [self._transform(dict(zip(names, setting, strict=True))) for setting in settings]
+        return pose_from_matrix(np.concatenate(transforms))[which.ravel()] if len(q) else np.zeros((0, 7))
 
     def root_in_object(self, object_pose: np.ndarray, q: np.ndarray) -> np.ndarray:
         """``T_object_root`` for objects in the base link's frame, both [n, 7]; q is [n, K]."""
@@ -129,12 +141,18 @@ class HandFrames:
 
     def _between(self) -> set[str]:
         """Joints that decide where the base link is, those that such a joint mimics included."""
-        into = {joint.child: joint for joint in self._urdf.joints}
+        into = {joint.child: joint for joint in self._urdf.joint_map.values()}
         found: set[str] = set()
         link = self.base
         while link in into:
-            name, link = into[link].name, into[link].parent
-            while name:
+            name = into[link].name
+            link = into[link].parent
+            while name and name not in found:
                 found.add(name)
                 name = self.mimics.get(name, ("", 0.0, 0.0))[0]
         return found
+
+    def _transform(self, setting: dict[str, float]) -> np.ndarray:
+        values = [setting.get(name, 0.0) for name in self._urdf.actuated_joint_names]
+        self._urdf.update_cfg(np.array(values))
+        return self._urdf.get_transform(self.root, self.base)[None]
