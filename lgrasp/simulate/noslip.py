@@ -63,12 +63,38 @@ class _Scratch:
     answer: wp.array3d(dtype=wp.float32)  # (W, R, V') accelerations that a unit force gives
 
 
+@wp.func
+def _solve(inertia: _Inertia, L: wp.array(dtype=wp.float32), x: wp.array(dtype=wp.float32)):
+    """Turn forces x (V) into accelerations, in place."""
+    n = inertia.first.shape[0]
+    for back in range(n):
+        i = n - 1 - back
+        last = inertia.first[i] + inertia.length[i] - 1
+        if x[i] != 0.0:
+            for k in range(inertia.first[i], last):
+                x[inertia.column[k]] = x[inertia.column[k]] - L[k] * x[i]
+            x[i] = x[i] / L[last]
+    for i in range(n):
+        for k in range(inertia.first[i], inertia.first[i] + inertia.length[i] - 1):
+            x[i] = x[i] - L[k] * x[inertia.column[k]]
+
+
 @wp.kernel
-def _factor(inertia: _Inertia, count: wp.array(dtype=wp.int32), scratch_out: _Scratch):
-    """Factor the inertia of each world that has constraints.
+def _factor(
+    inertia: _Inertia,
+    count: wp.array(dtype=wp.int32),
+    smooth: wp.array2d(dtype=wp.float32),
+    constraint: wp.array2d(dtype=wp.float32),
+    scratch_out: _Scratch,
+    acceleration_out: wp.array2d(dtype=wp.float32),
+):
+    """Factor the inertia of each world that has constraints; accelerations become those of the solver's forces.
 
     Args:
         count: (W,) constraints.
+        smooth: (W, V) forces without constraints [N or N m].
+        constraint: (W, V) those of constraints.
+        acceleration_out: (W, V).
     """
     w = wp.tid()
     if count[w] > 0:
@@ -86,6 +112,9 @@ def _factor(inertia: _Inertia, count: wp.array(dtype=wp.int32), scratch_out: _Sc
                 for j in range(k - first + 1):
                     L[above + j] = L[above + j] - share * L[first + j]
                 L[k] = share
+        for i in range(rows):
+            acceleration_out[w, i] = smooth[w, i] + constraint[w, i]
+        _solve(inertia, L, acceleration_out[w])
 
 
 @wp.kernel
@@ -98,27 +127,13 @@ def _fill(rows: _Rows, inertia: _Inertia, scratch_out: _Scratch):
         return
     J = scratch_out.jacobian[w, r]
     Y = scratch_out.answer[w, r]
-    L = scratch_out.factor[w]
     for i in range(J.shape[0]):
         J[i] = 0.0
         Y[i] = 0.0
     for k in range(rows.first[w, r], rows.first[w, r] + rows.length[w, r]):
         J[rows.column[w, 0, k]] = rows.value[w, 0, k]
         Y[rows.column[w, 0, k]] = rows.value[w, 0, k]
-    n = inertia.first.shape[0]
-    for back in range(n):
-        i = n - 1 - back
-        last = inertia.first[i] + inertia.length[i] - 1
-        y = Y[i]
-        if y != 0.0:
-            for k in range(inertia.first[i], last):
-                Y[inertia.column[k]] = Y[inertia.column[k]] - L[k] * y
-            Y[i] = y / L[last]
-    for i in range(n):
-        y = Y[i]
-        for k in range(inertia.first[i], inertia.first[i] + inertia.length[i] - 1):
-            y -= L[k] * Y[inertia.column[k]]
-        Y[i] = y
+    _solve(inertia, scratch_out.factor[w], Y)
 
 
 @wp.func
@@ -248,7 +263,8 @@ class NoSlip:
     def run(self) -> None:
         """Change the friction that the solver found, and with it the accelerations ``qacc``."""
         d, scratch = self._d, self._scratch
-        wp.launch(_factor, d.nworld, [self._inertia, d.nefc], [scratch])
+        forces = [d.nefc, d.qfrc_smooth, d.qfrc_constraint]
+        wp.launch(_factor, d.nworld, [self._inertia, *forces], [scratch, d.qacc])
         wp.launch(_fill, (d.nworld, d.njmax), [self._rows, self._inertia], [scratch])
         inputs = [self._rows, scratch, self._iterations]
         wp.launch_tiled(self._sweep, dim=[d.nworld], inputs=inputs, outputs=[d.qacc], block_dim=_LANES)

@@ -69,7 +69,9 @@ def one_world(m, d) -> tuple[SimpleNamespace, SimpleNamespace]:
         efc=efc,
         contact=contact,
         M=floats(d.M[None]),
-        qacc=floats(d.qacc[None]),
+        qfrc_smooth=floats(d.qfrc_smooth[None]),
+        qfrc_constraint=floats(d.qfrc_constraint[None]),
+        qacc=floats(0 * d.qacc[None]),
     )
     return model, data
 
