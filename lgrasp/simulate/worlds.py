@@ -185,8 +185,8 @@ class Placed(NamedTuple):
                 made.opt.solver = mujoco.mjtSolver.mjSOL_CG
             else:
                 made.opt.iterations = min(made.opt.iterations, _MOST_ITERATIONS)
+                made.opt.noslip_iterations = 0  # :class:`NoSlip` does it, faster
             made.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
-            made.opt.noslip_iterations = 0  # :class:`NoSlip` does it
         with wp.ScopedDevice(device):
             placed = cls(m, mujoco_warp.put_model(m), mujoco_warp.put_model(near))
         for one in placed[1:]:
@@ -206,7 +206,8 @@ class Worlds:
             per = {"nconmax": _CONTACTS_PER_OBJECT, "nccdmax": _DEEP_PER_OBJECT, "njmax": _CONSTRAINTS_PER_OBJECT}
             room = {name: number * len(model.object_body) for name, number in per.items()}
             self._d = d = mujoco_warp.make_data(m, nworld=worlds, **room)
-            self._noslip = NoSlip(self._m, d, model.protocol.noslip)
+            hard = model.protocol.noslip - m.opt.noslip_iterations
+            self._noslip = NoSlip(self._m, d, hard) if hard else None
             self._targets = t = _Targets()
             t.start, t.end, t.step = (wp.zeros((worlds, n), dtype=wp.float32) for n in (m.nu, m.nu, 1))
             t.ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
@@ -254,10 +255,13 @@ class Worlds:
     def _one_step(self) -> None:
         wp.launch(_drive, self._d.ctrl.shape, [self._targets], [self._d.ctrl])
         wp.launch(_count, self.worlds, [], [self._targets])
-        self._lib.forward(self._m, self._d)
-        self._noslip.run()
-        self._lib.mul_m(self._m, self._d, self._d.efc.Ma, self._d.qacc)  # what the integrator starts from
-        self._lib.implicit(self._m, self._d)
+        if self._noslip is None:
+            self._lib.step(self._m, self._d)
+        else:
+            self._lib.forward(self._m, self._d)
+            self._noslip.run()
+            self._lib.mul_m(self._m, self._d, self._d.efc.Ma, self._d.qacc)  # what the integrator starts from
+            self._lib.implicit(self._m, self._d)
 
     def begin(self, qpos: np.ndarray) -> None:
         """Everything at rest at qpos (W, nq), the drives' targets 0."""

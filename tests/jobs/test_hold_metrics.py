@@ -43,7 +43,7 @@ def add(cache_root):
 @pytest.fixture
 def tried(run, swift, tmp_path):
     """Shards of grasps that stage hold tried, none left out: rows of two passes."""
-    settings = ["hold.draws=2", "bounds.min_hold_probability=0", "search.passes=2"]
+    settings = ["hold.draws=2", "bounds.min_hold_probability=0", "bounds.max_unresisted_load=0.5", "search.passes=2"]
     pipeline = load_pipeline("robust-hold").with_settings(settings).model_copy(update={"field": swift.field})
     run(pipeline=pipeline, rows=60, shard_rows=30, out=tmp_path / "tried")
     return tmp_path / "tried"

@@ -76,7 +76,13 @@ def test_no_grasps(grasps, context):
 def test_a_bound_without_the_stage_is_refused():
     with pytest.raises(ConfigError, match=r"min_hold_probability is 0\.5, which only stage hold tells"):
         load_pipeline("robust").with_settings(["bounds.min_hold_probability=0.5"])
-    assert load_pipeline("robust-hold").bounds.min_hold_probability == 1
+
+
+def test_robust_hold_is_robust_and_then_hold():
+    before, both = load_pipeline("robust"), load_pipeline("robust-hold")
+    assert both.bounds == before.bounds.model_copy(update={"min_hold_probability": 1.0})
+    assert both.order == (*before.order, "hold")
+    assert all(both.params(stage) == before.params(stage) for stage in before.order)
 
 
 def test_refine_refuses_the_bound():
