@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
+from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order, evenly
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.piece import Piece
 from lgrasp.object.model import ObjectModel
@@ -62,7 +62,7 @@ def hand_solids(model: HandModel, count: int) -> HandPoints:
         samples = _link_samples(model, pieces, own)
         chosen = [pieces[i] for i in own]
         part = share[bool(model.piece_body[own[0]] == 0)]
-        solids.append(_solid(_thinned(samples, round(part * len(samples))), _ball(chosen), _grid(chosen)))
+        solids.append(_solid(evenly(samples, max(round(part * len(samples)), RUN)), _ball(chosen), _grid(chosen)))
     links = np.array(list(members))  # sorted
     pairs = np.unique(np.sort(model.piece_link[model.pairs], axis=1), axis=0)
     return HandPoints(links, model.tree.link_body[links], tuple(solids), np.searchsorted(links, pairs))
@@ -72,13 +72,7 @@ def object_solid(model: ObjectModel, count: int) -> PointSolid:
     """An object in its internal frame, with ``count`` surface points (rounded up to whole runs)."""
     points = model.obstacle_points
     ball = np.array([0.0, 0.0, 0.0, np.linalg.norm(points, axis=1).max()])  # the centre of the bounding box
-    return _solid(_thinned(points, count), ball, model.grid)
-
-
-def _thinned(points: np.ndarray, count: int) -> np.ndarray:
-    """``count`` of the points, at least RUN, evenly out of their order; repeated where there are not so many."""
-    count = max(count, RUN)
-    return points[((np.arange(count) + 0.5) * len(points) / count).astype(int)]
+    return _solid(evenly(points, max(count, RUN)), ball, model.grid)
 
 
 def _solid(points: np.ndarray, ball: np.ndarray, grid: SdfGrid) -> PointSolid:

@@ -44,6 +44,11 @@ def one_per_cell(points: np.ndarray, size: float) -> np.ndarray:
     return np.sort(np.unique(cells(points, size), return_index=True)[1])
 
 
+def evenly(points: np.ndarray, count: int) -> np.ndarray:
+    """``count`` of the points (n, 3), evenly out of their order; repeated where there are not so many."""
+    return points[((np.arange(count) + 0.5) * len(points) / count).astype(int)]
+
+
 def bounding_spheres(points: np.ndarray, *, size: int = CLUSTER_SIZE) -> tuple[np.ndarray, np.ndarray]:
     """Nearly smallest balls around runs of ``size`` points (Bădoiu–Clarkson core-set iteration).
 

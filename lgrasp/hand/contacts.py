@@ -1,7 +1,6 @@
 """Contact surfaces: where on its links a hand may touch, as points, normals and patches, and as link distance grids."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -9,6 +8,7 @@ import trimesh
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.model import csr
 from lgrasp.hand.spec import Cone, Surface
+from lgrasp.object.sdf import SdfGrid
 
 _GRID_CELL = 8.0e-4  # [m], more on large links
 _ROUNDING = 1e-6  # [m] of distances in single precision
@@ -23,16 +23,7 @@ _PATCH_RADIUS = 0.010  # [m]
 _PATCH_CONE = np.radians(36.0)  # [rad]
 
 
-@dataclass(frozen=True)
-class LinkGrid:
-    """Signed distance grid of one link in its body frame."""
-
-    values: np.ndarray  # (nx, ny, nz) f32 [m]
-    origin: np.ndarray  # (3,) [m]
-    cell: float
-
-
-def grid_arrays(grids: Sequence[LinkGrid], prefix: str = "") -> dict[str, np.ndarray]:
+def grid_arrays(grids: Sequence[SdfGrid], prefix: str = "") -> dict[str, np.ndarray]:
     """Arrays ``grid_*`` of a HandModel, their names after a prefix."""
     arrays = {
         "first": csr([grid.values.size for grid in grids]),
@@ -44,7 +35,7 @@ def grid_arrays(grids: Sequence[LinkGrid], prefix: str = "") -> dict[str, np.nda
     return {f"{prefix}grid_{name}": array for name, array in arrays.items()}
 
 
-def link_grid(meshes: Sequence[trimesh.Trimesh], device: str) -> LinkGrid:
+def link_grid(meshes: Sequence[trimesh.Trimesh], device: str) -> SdfGrid:
     """Distance grid of the union of a link's solids (already in the body frame)."""
     low = np.min([m.bounds[0] for m in meshes], 0) - _GRID_PAD
     high = np.max([m.bounds[1] for m in meshes], 0) + _GRID_PAD
@@ -53,7 +44,7 @@ def link_grid(meshes: Sequence[trimesh.Trimesh], device: str) -> LinkGrid:
 
 def box_grid(
     meshes: Sequence[trimesh.Trimesh], low: np.ndarray, high: np.ndarray, cell: float, device: str, **sign: bool
-) -> LinkGrid:
+) -> SdfGrid:
     """Distance grid of the union of solids in a box with corners (3,) [m]; ``sign`` as of :func:`signed_distance`."""
     shape = np.ceil((high - low) / cell).astype(int) + 1
     axes = [low[a] + cell * np.arange(shape[a]) for a in range(3)]
@@ -62,7 +53,7 @@ def box_grid(
     for mesh in meshes[1:]:
         near = np.flatnonzero(_box_distance(mesh, points) <= values + _ROUNDING)  # no other can be nearer
         values[near] = np.minimum(values[near], signed_distance(mesh, points[near], device, **sign))
-    return LinkGrid(values.reshape(shape).astype(np.float32), low.astype(np.float32), cell)
+    return SdfGrid(values.reshape(shape).astype(np.float32), low.astype(np.float32), cell)
 
 
 def in_cone(normals: np.ndarray, cone: Cone) -> np.ndarray:

@@ -12,9 +12,10 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.clusters import one_per_cell
-from lgrasp.hand.contacts import LinkGrid, box_grid, grid_arrays
+from lgrasp.hand.contacts import box_grid, grid_arrays
 from lgrasp.hand.model import csr, stack_rows
 from lgrasp.hand.self_collision import OVERLAP
+from lgrasp.object.sdf import SdfGrid
 
 _POINT_SPACING = 8.0e-4  # [m]
 _MAX_POINTS = 20_000
@@ -31,7 +32,7 @@ class OverlapSide:
     body: int  # of the points
     grid_body: int
     points: np.ndarray  # (n, 3) [m], body frame, those that are deepest most often first
-    grid: LinkGrid
+    grid: SdfGrid
     depth: np.ndarray  # (N,) [m] deepest point at each posture, 0 when apart
 
 
@@ -45,7 +46,7 @@ def _surface(meshes: Sequence[trimesh.Trimesh]) -> np.ndarray:
     return points[one_per_cell(points, _POINT_SPACING)][:_MAX_POINTS]
 
 
-def _lookup(grid: LinkGrid, p: np.ndarray) -> np.ndarray:
+def _lookup(grid: SdfGrid, p: np.ndarray) -> np.ndarray:
     """Signed distances of points (..., 3) by trilinear interpolation; far (1 m) beyond the grid."""
     from scipy.ndimage import map_coordinates
 

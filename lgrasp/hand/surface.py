@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from lgrasp.hand.contacts import LinkGrid, cover_patches, grid_arrays, link_grid
+from lgrasp.hand.contacts import cover_patches, grid_arrays, link_grid
 from lgrasp.hand.model import csr, stack_rows
 from lgrasp.hand.tree import Tree
+from lgrasp.object.sdf import SdfGrid
 
 
 @dataclass(frozen=True)
@@ -49,15 +50,15 @@ def contact_arrays(
     rng: np.random.Generator,
     device: str,
     *,
-    known: Mapping[str, LinkGrid] | None = None,
+    known: Mapping[str, SdfGrid] | None = None,
 ) -> dict[str, np.ndarray]:
     """Arrays ``contact_*``, ``grid_*``, ``rule*`` and ``mesh_*`` of a HandModel.
 
     Args:
         meshes: solids of each link, body frame. known: distance grids that need not be made.
     """
-    made: dict[bytes, LinkGrid] = {}
-    grids: list[LinkGrid] = []
+    made: dict[bytes, SdfGrid] = {}
+    grids: list[SdfGrid] = []
     for entry in links:
         # fingertips of one shape share one grid's work
         key = b"".join(np.round(m.vertices, 9).tobytes() for m in meshes[entry.link])

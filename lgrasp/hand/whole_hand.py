@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from lgrasp.hand.contacts import LinkGrid
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.surface import ContactLink, contact_arrays
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.hand.urdf import Urdf, read_urdf
+from lgrasp.object.sdf import SdfGrid
 
 _LEAST_POINTS = 12  # of a link's samples that the fingertips see
 _MOST_POINTS = 160  # of a finger link
@@ -63,6 +63,6 @@ def surface_arrays(model: HandModel, urdf: Urdf, links: Sequence[ContactLink], d
     """What a hand has of its contact surface, if these are all links that may touch; known grids are taken over."""
     names, parts = model.tree.link_names, np.split(model.grid_values, model.grid_first[1:-1])
     rows = zip(model.grid_link, parts, model.grid_shape, model.grid_origin, model.grid_cell, strict=True)
-    known = {names[k]: LinkGrid(part.reshape(shape), origin, float(cell)) for k, part, shape, origin, cell in rows}
+    known = {names[k]: SdfGrid(part.reshape(shape), origin, float(cell)) for k, part, shape, origin, cell in rows}
     meshes = {link.link: link_meshes(urdf, model.tree, link.link) for link in links}
     return contact_arrays(model.tree, links, meshes, np.random.default_rng(0), device, known=known)

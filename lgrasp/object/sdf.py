@@ -80,15 +80,7 @@ def build_sdf(
 def sample_sdf(sdf: SdfGrid, points: np.ndarray) -> np.ndarray:
     """Trilinear distances [m], shape (n,), at points [m], shape (n, 3); points outside the grid are clamped to it."""
     at = (np.asarray(points, np.float64) - sdf.origin) / sdf.cell
-    top = np.array(sdf.values.shape) - 1
-    at = np.clip(at, 0.0, top)
-    low = np.minimum(at.astype(np.int64), top - 1)
-    w = at - low
-    out = np.zeros(len(at))
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, w, 1.0 - w).prod(axis=1)
-        out += weight * sdf.values[tuple((low + corner).T)]
-    return out
+    return ndimage.map_coordinates(sdf.values, at.T, np.float64, order=1, mode="nearest")
 
 
 def _layout(vertices: np.ndarray, max_cells: int, min_cell: float, pad: float) -> tuple[np.ndarray, float, tuple]:

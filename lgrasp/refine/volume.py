@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from lgrasp.geometry.clusters import evenly
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.structs import upload_struct
@@ -59,8 +60,7 @@ def upload_target(model: ObjectModel, around: ObjectModel | None, device: str) -
 
 def solid_cloud(model: ObjectModel) -> np.ndarray:
     """Some points of an object's surface, evenly spread [m], (n, 3)."""
-    count = min(_CLOUD_POINTS, len(model.obstacle_points))
-    return model.obstacle_points[((np.arange(count) + 0.5) * len(model.obstacle_points) / count).astype(int)]
+    return evenly(model.obstacle_points, min(_CLOUD_POINTS, len(model.obstacle_points)))
 
 
 def _volume(model: ObjectModel, device: str) -> "Volume":

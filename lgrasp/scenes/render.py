@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
+from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.depth import Images, LabelledMesh
 from lgrasp.runtime.device import start
@@ -64,7 +65,7 @@ def merge_views(images: Images, offsets: np.ndarray, params: CameraParams, devic
     T = pose_matrix(images.pose)
     local = images.intrinsics.points(images.depth)[v, i, j]
     points = np.einsum("nab,nb->na", T[v, :3, :3], local) + (T[:, :3, 3] + offsets)[v]
-    kept = _one_per_voxel(points, params.voxel)
+    kept = one_per_cell(points, params.voxel) if params.voxel > 0.0 else slice(None)
     v, i, j = v[kept], i[kept], j[kept]
     return CloudRecord(
         points=points[kept].astype(np.float32),
@@ -72,14 +73,3 @@ def merge_views(images: Images, offsets: np.ndarray, params: CameraParams, devic
         labels=images.labels[v, i, j].astype(np.int16),
         view=v.astype(np.int16),
     )
-
-
-def _one_per_voxel(points: np.ndarray, voxel: float) -> np.ndarray:
-    """Indices of the first point in every cube, rising."""
-    if voxel <= 0.0 or not len(points):
-        return np.arange(len(points))
-    cell = np.floor(points / voxel).astype(np.int64)
-    cell -= cell.min(axis=0)
-    sides = cell.max(axis=0) + 1
-    key = (cell[:, 0] * sides[1] + cell[:, 1]) * sides[2] + cell[:, 2]
-    return np.sort(np.unique(key, return_index=True)[1])
