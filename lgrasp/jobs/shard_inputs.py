@@ -66,7 +66,7 @@ def hand_of_shard(
         ShardError: a mesh of the hand is missing from the shard.
         HandError: the hand cannot be used, or no rules fit it.
     """
-    source = _with_rules(_files(record), record, config)
+    source = _with_rules(write_hand(record, scratch_folder()), record, config)
     if source.note:
         cache.warn(f"the shard does not hold the rules of its hand '{record.name}'; taken are {source.note}")
     return _built(cache, source, device, _surface(config))
@@ -137,11 +137,6 @@ def _surface(config: Mapping[str, Any]) -> HandParams:
     pipeline = config.get("pipeline")
     told = pipeline.get("hand", {}) if isinstance(pipeline, dict) else {}
     return HandParams.model_validate(told) if isinstance(told, dict) else LISTED
-
-
-def _files(record: HandRecord) -> Path:
-    """The URDF of a shard's hand beside its meshes, in a folder that goes when the program ends."""
-    return write_hand(record, scratch_folder())
 
 
 def _with_rules(urdf: Path, record: HandRecord, config: Mapping[str, Any]) -> HandSource:

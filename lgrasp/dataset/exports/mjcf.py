@@ -64,7 +64,9 @@ class MjcfWriter:
         self._selection, self._frames, self._cut = selection, frames, cut
         self._hand = {f"{HAND}/{name}": data for name, data in hand_files(selection.hand, selection.shards[0]).items()}
         self._object = cache(self._make_object)
-        self._scene = lru_cache(maxsize=16)(self._make_scene)
+        self._scene = lru_cache(maxsize=16)(
+            lambda objects: MjcfScene(self._hand, frames, [*map(self._object, objects)])
+        )
         index = next(selection.batches()).object_index[0]
         self._scene(tuple(index[index >= 0].tolist()))
 
@@ -88,9 +90,6 @@ class MjcfWriter:
                 ]
                 write_file(out / GRASPS / f"{number:08d}.xml", self._scene(objects).text(keys), flush=False)
                 advance(1)
-
-    def _make_scene(self, objects: tuple[int, ...]) -> MjcfScene:
-        return MjcfScene(self._hand, self._frames, [self._object(place) for place in objects])
 
     def _make_object(self, place: int) -> SceneObject:
         item = self._selection.objects[place]

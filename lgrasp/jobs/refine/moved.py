@@ -22,7 +22,7 @@ from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.energy import Energies
 from lgrasp.refine.improve import improve
-from lgrasp.refine.refiner import Pose, Refiner, table_pose
+from lgrasp.refine.refiner import Refiner, table_pose
 from lgrasp.stages.refine.params import RefineParams
 
 _BATCH_ROWS = 256  # at a time
@@ -147,9 +147,11 @@ def _moved_part(
     at = np.flatnonzero(taken)
     new = widen_grasps(new, old.contact_links.shape[1])
     table = choose_grasps(widen_grasps(old, new.contact_links.shape[1]), new, at, at)
-    energy = tuple(_numbers(refiner.energy(*pose)) for pose in (given, table_pose(table, hand.device)))
-    far = int((_distance(given, refiner) > _MAX_OBJECT_DISTANCE).sum())
-    return _Part(table, (energy[0], energy[1]), (was, known, taken, good, failed_bounds(new, outcome, bounds)), far)
+    energies = [refiner.energy(*pose) for pose in (given, table_pose(table, hand.device))]
+    before, after = (torch.stack(list(terms)).detach().cpu().numpy() for terms in energies)  # each (6, N)
+    away = refiner.target.nearest(refiner.middle(given.R, given.t))[0]  # of the middle of the palmar side
+    far = int((away > _MAX_OBJECT_DISTANCE).sum())
+    return _Part(table, (before, after), (was, known, taken, good, failed_bounds(new, outcome, bounds)), far)
 
 
 def _rounded(bounds: GraspBounds) -> GraspBounds:
@@ -193,16 +195,6 @@ def _hands(rows: GraspRows, part: slice, hand: HandArrays, obj: ObjectModel) -> 
     q = np.clip(np.asarray(rows.q)[part, : hand.model.dofs], tree.joint_lower, tree.joint_upper)
     pose = internal_poses(np.asarray(rows.object_pose)[part, 0], obj.center)
     return pose, np.ascontiguousarray(q, np.float32)
-
-
-def _distance(pose: Pose, refiner: Refiner) -> np.ndarray:
-    """Of the middle of the palmar side from the object [m], (N,)."""
-    return refiner.target.nearest(refiner.middle(pose.R, pose.t))[0].cpu().numpy()
-
-
-def _numbers(energies: Energies) -> np.ndarray:
-    """Terms, (6, N)."""
-    return torch.stack(list(energies)).detach().cpu().numpy()
 
 
 def _kept(old: GraspRows, new: GraspRows, take: np.ndarray, measured: bool) -> GraspRows:
