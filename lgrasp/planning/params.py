@@ -4,6 +4,7 @@ from pydantic import Field
 
 from lgrasp.config import Params
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.hold.params import HoldTest
 from lgrasp.refine.params import DISTAL, OTHER, LocalSearch
 
 _CLOUD_GAP = 6.0e-3  # [m]
@@ -57,14 +58,22 @@ class PlanParams(Params):
     rank_friction: float = Field(
         default=0.3, gt=0, le=2, description="Friction coefficient at which the hands of a start are compared."
     )
-    tried: int = Field(
-        default=3,
+    tried: int | None = Field(
+        default=None,
         ge=0,
         le=64,
-        description="Hands of each start that are tried at most, those that resist most first: the first that holds is "
-        "the plan. 0: none.",
+        description="Hands of each start that are tried at most, those that resist most first, until one always holds: "
+        "the one that holds most often is the plan. 0: none; default: 3 of those that a network draws, else 10.",
+    )
+    hold: HoldTest | None = Field(
+        default=None, description="How they are tried; default: once those that a network draws, others with draws."
     )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
+
+    def trials(self, *, drawn: bool) -> tuple[int, HoldTest]:
+        """``tried`` and ``hold`` as they are, of hands that a network drew or not."""
+        tried, hold = (3, HoldTest(draws=0)) if drawn else (10, HoldTest())
+        return tried if self.tried is None else self.tried, self.hold or hold
 
     def weights(self) -> dict[str, float]:
         """Arguments of :func:`hand_surface`."""

@@ -126,7 +126,7 @@ class Planner:
         around = None if self.around is None else upload_object(self.around, device)
         target = upload_target(self.model, self.around, device)
         obj, search = upload_object(self.model, device), Descent(self.hand, target, self.params.search, surface)
-        return _Scene(search, obj, around, _tester(self.hand, obj))
+        return _Scene(search, obj, around, _tester(self.hand, obj, self._trials[1]))
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
@@ -167,13 +167,12 @@ class Planner:
         return self._only(np.flatnonzero(place < p.finalists), start, at)
 
     def _steadiest(self, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
-        """One hand of each start: of those tried the first that holds, else the one that resists most."""
+        """One hand of each start: of those tried the one that holds most often, then the one that resists most."""
         table, place, passed = self._ranked(start, at, self.params.bounds)
-        held = self._held(table, np.where(passed, place, self.params.tried))
-        place = np.where(held, place - len(place), place)
-        best = np.full(start.max() + 1, len(place))
-        np.minimum.at(best, start, place)
-        return self._only(np.flatnonzero(place == best[start]), start, at)
+        held = self._held(table, np.where(passed, place, self._trials[0]))
+        order = np.lexsort([place, -held, start])
+        first = np.flatnonzero(np.diff(start[order], prepend=-1))
+        return self._only(np.sort(order[first]), start, at)
 
     def _ranked(self, start: np.ndarray, at: Hands, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray, np.ndarray]:
         """All hands, the place of each among those of its start (those that pass the checks first, then those that
@@ -186,18 +185,24 @@ class Planner:
         return table, place, passed
 
     def _held(self, table: GraspTable, place: np.ndarray) -> np.ndarray:
-        """Which hands hold when they are tried, (M,): of each start those at the first places, until one holds; twice
-        as many at once each time, since few trials keep a GPU as long as many."""
-        held, tester, first = np.zeros(len(place), bool), self._scene.tester, 0
-        while tester is not None and first < self.params.tried:
-            last = min(2 * first + 1, self.params.tried)
-            done = np.isin(table.index, table.index[held])
+        """Share of the trials in which each hand holds, (M,): of each start those at the first places are tried, until
+        one always holds; twice as many at once each time, since few trials keep a GPU as long as many."""
+        held, tester, first = np.zeros(len(place)), self._scene.tester, 0
+        tried, draws = self._trials[0], self._trials[1].draws
+        while tester is not None and first < tried:
+            last = min(2 * first + 1, tried)
+            done = np.isin(table.index, table.index[held == 1])
             rows = np.flatnonzero((place >= first) & (place < last) & ~done)
             if not len(rows):
                 break
-            held[rows] = tester.run(ControlPoses.of(take_grasps(table, rows)), 0)["hold_success"] > 0
+            found = tester.run(ControlPoses.of(take_grasps(table, rows)), 0)
+            held[rows] = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
             first = last
         return held
+
+    @cached_property
+    def _trials(self) -> tuple[int, HoldTest]:
+        return self.params.trials(drawn=self.guesses is not None)
 
     def _only(self, rows: np.ndarray, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
         pose, q = at.arrays()
@@ -240,8 +245,8 @@ class _Scene:
     """None: nothing is known of the object but a plane, which has no mass."""
 
 
-def _tester(hand: HandArrays, obj: ObjectArrays) -> HoldTester | None:
+def _tester(hand: HandArrays, obj: ObjectArrays, test: HoldTest) -> HoldTester | None:
     try:
-        return HoldTester(hand, obj, HoldTest(draws=0))
+        return HoldTester(hand, obj, test)
     except ObjectError:
         return None

@@ -58,19 +58,23 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
     np.testing.assert_array_equal(few.grasps.pose, planned.grasps.pose[same])
 
 
-def test_of_several_hands_the_plan_is_the_first_that_holds(inputs):
-    def holding(tried):
-        params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": tried})
-        table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(24).grasps  # of few none may differ
-        found = HoldTester(inputs.hand, inputs.object, HoldTest(draws=0)).run(ControlPoses.of(table), 0)
-        return dict(zip(table.index.tolist(), found["hold_success"].tolist(), strict=True)), table
+@pytest.mark.parametrize("draws", [0, 4])
+def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, draws):
+    test = HoldTest(draws=draws)
 
-    (tried, plans), (untried, first), (alone, _) = holding(12), holding(0), holding(1)
+    def shares(tried):
+        params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": tried, "hold": test})
+        table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(24).grasps  # of few none may differ
+        found = HoldTester(inputs.hand, inputs.object, test).run(ControlPoses.of(table), 0)
+        share = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
+        return dict(zip(table.index.tolist(), share.tolist(), strict=True)), table
+
+    (tried, plans), (untried, first), (alone, _) = shares(12), shares(0), shares(1)
     assert tried.keys() == untried.keys()
     assert sum(tried.values()) > sum(untried.values())
-    assert alone == untried  # one hand of each start is the best, whether or not it holds
-    held = [untried[start] == 1 for start in first.index.tolist()]  # where the best holds, it is the plan
-    np.testing.assert_array_equal(plans.q[held], first.q[held])
+    assert alone == untried  # one hand of each start is the best, however often it holds
+    always = [untried[start] == 1 for start in first.index.tolist()]  # where the best always holds, it is the plan
+    np.testing.assert_array_equal(plans.q[always], first.q[always])
 
 
 def test_of_a_plane_nothing_is_tried(inputs):
