@@ -1,12 +1,11 @@
 """Verdicts of many grasps at once with MuJoCo Warp: worlds side by side on one device."""
 
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import warp as wp
 
 from lgrasp.geometry.poses import compose, pose_from_matrix
 from lgrasp.grasp.records import GraspRows
@@ -58,7 +57,6 @@ class WorldTrials:
     Args:
         device: Warp device.
         worlds: hands closed at a time.
-        lanes: blocks of grasps that are on their way side by side: a GPU has work while one of them ends.
         all_directions, settled_stop: as of :class:`Trial`.
     """
 
@@ -68,68 +66,16 @@ class WorldTrials:
         device: str,
         *,
         worlds: int = 4096,
-        lanes: int = 2,
         all_directions: bool = False,
         settled_stop: bool = True,
     ) -> None:
-        self._device, self._one = wp.get_device(device), threading.Lock()
-        self._size = max(1, worlds // lanes)
-        placed, spare = Placed.of(model, device), Trial(model, all_directions=all_directions, settled_stop=settled_stop)
-        self._streams = [wp.Stream(self._device) if self._device.is_cuda else None for _ in range(lanes)]
-        self._lanes = []
-        for stream in self._streams:
-            with wp.ScopedStream(stream):
-                self._lanes.append(_Lane(model, placed, self._size, device, spare, all_directions, settled_stop))
-
-    @property
-    def steps(self) -> int:
-        """World-steps simulated so far."""
-        return sum(lane.steps for lane in self._lanes)
-
-    def run(self, rows: GraspRows, progress: Callable[[int, int], None] | None = None) -> list[Verdict]:
-        """The verdicts of all rows."""
-        starts = iter(range(0, len(rows), self._size))
-        blocks: dict[int, tuple[int, Generator[None, None, list[Verdict]]]] = {}  # of each lane
-        found: dict[int, list[Verdict]] = {}
-        with self._one:
-            while True:
-                for lane, stream in enumerate(self._streams):
-                    if lane not in blocks and (first := next(starts, None)) is not None:
-                        index = np.arange(first, min(first + self._size, len(rows)))
-                        blocks[lane] = first, self._lanes[lane].run(rows, index)
-                    if lane in blocks:
-                        first, block = blocks[lane]
-                        try:
-                            with wp.ScopedStream(stream):
-                                next(block)
-                        except StopIteration as end:
-                            found[first] = end.value
-                            del blocks[lane]
-                            if progress:
-                                some = [verdict for verdicts in found.values() for verdict in verdicts]
-                                progress(len(some), sum(verdict.holds for verdict in some))
-                if not blocks:
-                    return [verdict for first in sorted(found) for verdict in found[first]]
-
-
-class _Lane:
-    """A block of grasps at a time. Its generators yield whenever the device has been given work."""
-
-    def __init__(
-        self,
-        model: Model,
-        placed: Placed,
-        worlds: int,
-        device: str,
-        spare: Trial,
-        all_directions: bool,
-        settled_stop: bool,
-    ) -> None:
         self._model, self._protocol = model, model.protocol
+        placed = Placed.of(model, device)
         self._sim = Worlds(model, placed, worlds, device)
         self._pulled = [Worlds(model, placed, max(1, int(worlds * share)), device) for share in _SHARES]
         self._every, self._settled_stop = all_directions, settled_stop
-        self._spare, self._bounds = spare, Bounds(model.protocol)
+        self._spare = Trial(model, all_directions=all_directions, settled_stop=settled_stop)
+        self._bounds, self._one = Bounds(model.protocol), threading.Lock()
         at, turn = (a[0, model.base_body].astype(float) for a in self._sim.frames())
         T = np.block([[turn, at[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
         self._base, self._base_rotation = pose_from_matrix(T[None])[0], turn
@@ -139,12 +85,21 @@ class _Lane:
         """World-steps simulated so far."""
         return self._sim.steps + sum(sim.steps for sim in self._pulled)
 
-    def run(self, rows: GraspRows, index: np.ndarray) -> Generator[None, None, list[Verdict]]:
-        """The verdicts of some rows, no more than there are worlds."""
+    def run(self, rows: GraspRows, progress: Callable[[int, int], None] | None = None) -> list[Verdict]:
+        """The verdicts of all rows."""
+        found: list[Verdict] = []
+        with self._one:
+            for first in range(0, len(rows), self._sim.worlds):
+                found += self._block(rows, np.arange(first, min(first + self._sim.worlds, len(rows))))
+                if progress:
+                    progress(len(found), sum(verdict.holds for verdict in found))
+        return found
+
+    def _block(self, rows: GraspRows, index: np.ndarray) -> list[Verdict]:
         n, links, points = len(index), rows.contact_links[index], rows.contact_points[index]
         look, full = self._look(rows, index)
         alive = look.depth <= self._protocol.most_penetration
-        hands = yield from self._close(rows, index, look)
+        hands = self._close(rows, index, look)
         hands.full |= full
         kept, (at, turn) = self._sim.keep(), self._sim.frames()
         slip = slips(self._model, (at[:n], turn[:n]), links, look.points, points)
@@ -152,7 +107,7 @@ class _Lane:
         lost = hands.wild | self._bounds.lost(hands.worst)
         good = alive & ~lost
         hands.worst[hands.wild | ~alive] = np.nan
-        pulls, ran_away = yield from self._pull(hands, kept, good)
+        pulls, ran_away = self._pull(hands, kept, good)
         pulls.held[alive & lost] = 0
         pulls.moved[alive & lost] = hands.worst[alive & lost][:, None]
         closed = Closed(
@@ -194,7 +149,7 @@ class _Lane:
         """Values of n grasps (n, ...) for all worlds (W, ...)."""
         return np.concatenate([values, np.repeat(values[:1], self._sim.worlds - len(values), 0)])
 
-    def _close(self, rows: GraspRows, index: np.ndarray, look: Look) -> Generator[None, None, _Closing]:
+    def _close(self, rows: GraspRows, index: np.ndarray, look: Look) -> _Closing:
         """From the start to the squeeze, as of :class:`Trial`."""
         n, sim = len(index), self._sim
         stops = [self._filled(self._model.controls(q[index].astype(float))) for q in self._protocol.stops(rows)]
@@ -205,12 +160,11 @@ class _Lane:
         hands = _Closing(home, depth, np.zeros((n, home.shape[1], 2)), none > 0, none > 0, none, sim.look())
         for a, b in pairwise(stops):
             if b is stops[-1]:  # the targets are q, the squeeze is next
-                hands.contacts = yield from self._touching_at_rest(hands, a)
+                hands.contacts = self._touching_at_rest(hands, a)
             sim.drive(a, b)
             seconds = self._protocol.phase + (self._protocol.rest if b is stops[-1] else 0.0)
             for _ in range(max(1, round(seconds / CHUNK))):
                 sim.advance()
-                yield
                 hands.now = now = sim.look()
                 hands.worst = np.maximum(hands.worst, sim.moved(now.qpos, home)[:n])
                 hands.wild |= now.wild[:n]
@@ -218,7 +172,7 @@ class _Lane:
                 hands.full |= now.full[:n]
         return hands
 
-    def _touching_at_rest(self, hands: _Closing, targets: np.ndarray) -> Generator[None, None, np.ndarray]:
+    def _touching_at_rest(self, hands: _Closing, targets: np.ndarray) -> np.ndarray:
         """Links on the object that the fewest touch, (n,), once hands have caught up with their targets (W, nu); they
         then continue from the previous state."""
         n, sim = len(hands.full), self._sim
@@ -226,13 +180,12 @@ class _Lane:
         sim.drive(targets, targets)
         for _ in range(max(1, round(self._protocol.settle / CHUNK))):
             sim.advance()
-            yield
         links, _, full = sim.touching()
         hands.full |= full[:n]
         sim.take(before, np.arange(sim.worlds))
         return links[:n].min(1)
 
-    def _pull(self, hands: _Closing, kept: Kept, good: np.ndarray) -> Generator[None, None, tuple[Pulls, np.ndarray]]:
+    def _pull(self, hands: _Closing, kept: Kept, good: np.ndarray) -> tuple[Pulls, np.ndarray]:
         """Every direction of every good grasp, in whatever world is free, and which diverged; as of :class:`Trial`.
 
         Args:
@@ -279,7 +232,6 @@ class _Lane:
                 job[len(busy) :] = -1
                 busy = np.arange(len(busy))
             sim.advance()
-            yield
             now = sim.look()
             here, wild, touches = sim.moved(now.qpos, home), now.wild, now.links > 0
             worst, depth = np.maximum(worst, here), np.where(wild, depth, np.maximum(depth, now.depth))
