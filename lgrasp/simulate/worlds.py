@@ -206,8 +206,8 @@ class Worlds:
             per = {"nconmax": _CONTACTS_PER_OBJECT, "nccdmax": _DEEP_PER_OBJECT, "njmax": _CONSTRAINTS_PER_OBJECT}
             room = {name: number * len(model.object_body) for name, number in per.items()}
             self._d = d = mujoco_warp.make_data(m, nworld=worlds, **room)
-            hard = model.protocol.noslip - m.opt.noslip_iterations
-            self._noslip = NoSlip(self._m, d, hard) if hard else None
+            sweeps = 0 if m.opt.noslip_iterations else model.protocol.noslip  # else the library does them
+            self._noslip = NoSlip(self._m, d, sweeps) if sweeps else None
             self._targets = t = _Targets()
             t.start, t.end, t.step = (wp.zeros((worlds, n), dtype=wp.float32) for n in (m.nu, m.nu, 1))
             t.ramp = float(max(1, round(model.protocol.phase / m.opt.timestep)))
