@@ -16,6 +16,9 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 _COLUMNS = MAX_TOUCHES * MAX_DOFS
 _REACH = wp.constant(2.0e-3)  # [m] contacts are looked for within
+DRAWN_NUMBERS = wp.constant(12)
+"""That a trial has, of the ranges of :class:`Spread` in turn, three each of ``shift`` and ``turn``."""
+vec_numbers = wp.types.vector(12, wp.float32)
 _TRAVEL = wp.constant(1.0e-3)  # [m] of hand and object after which they are looked for afresh
 
 
@@ -38,6 +41,9 @@ class Course:
 @wp.struct
 class Spread:
     """Ranges that numbers are drawn from, evenly; ``shift`` and ``turn`` bound the error of the object's pose."""
+
+    seed: wp.int32
+    strata: wp.array2d(dtype=wp.float32)  # (D, 12) where in its range, from 0 to 1, each number of each draw is
 
     friction: wp.vec2
     torsion: wp.vec2  # [m]
@@ -77,7 +83,7 @@ class Trials:
     """Trials, and where they stand once the hand has closed."""
 
     row: wp.array(dtype=wp.int32)  # (T,)
-    seed: wp.array(dtype=wp.int32)  # (T,) of its numbers, with that of its grasp
+    draw: wp.array(dtype=wp.int32)  # (T,) which of its grasp's draws it is
     start: wp.array(dtype=wp.transform)  # (T,) T_hand_object
     material: wp.array(dtype=Material)  # (T,) its ``drag`` is the damping [N m s/rad]
     mass: wp.array(dtype=wp.float32)  # (T,) [kg]
@@ -95,13 +101,24 @@ class TrialPulls:
 
 
 @wp.func
-def _between(rng: wp.uint32, ends: wp.vec2):
-    return ends[0] + (ends[1] - ends[0]) * wp.randf(rng)
+def _share(rng: wp.uint32, spread: Spread, draw: wp.int32, number: wp.int32):
+    """Where in its range a number is: the strata of a grasp's draws, all moved on by as much, round and round."""
+    u = spread.strata[draw, number] + wp.randf(rng)
+    return u - wp.floor(u)
 
 
 @wp.func
-def _in_ball(rng: wp.uint32, radius: float):
-    return wp.sample_unit_sphere(rng) * radius
+def _between(ends: wp.vec2, share: wp.float32):
+    return ends[0] + (ends[1] - ends[0]) * share
+
+
+@wp.func
+def _in_ball(radius: wp.float32, z: wp.float32, around: wp.float32, out: wp.float32):
+    """A point of the ball, evenly if the shares are even."""
+    up = 2.0 * z - 1.0
+    flat = wp.sqrt(wp.max(1.0 - up * up, 0.0))
+    angle = 2.0 * wp.pi * around
+    return wp.vec3(flat * wp.cos(angle), flat * wp.sin(angle), up) * radius * wp.cbrt(out)
 
 
 @wp.func
@@ -286,25 +303,28 @@ def close_hands(
     """One thread per trial: draw its numbers and close the hand on the object.
 
     Args:
-        trials: ``row`` and ``seed`` are given, all else is written.
+        trials: ``row`` and ``draw`` are given, all else is written.
     """
     i = wp.tid()
     row = trials.row[i]
     contacts = wp.zeros(shape=(MAX_TOUCHES,), dtype=Contact)
     scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
     q = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    rng = wp.rand_init(trials.seed[i], grasps.number[row])
+    rng = wp.rand_init(spread.seed, grasps.number[row])
+    u = vec_numbers()
+    for k in range(DRAWN_NUMBERS):
+        u[k] = _share(rng, spread, trials.draw[i], k)
     m = Material()
-    m.friction = _between(rng, spread.friction)
-    m.torsion = _between(rng, spread.torsion)
-    trials.mass[i] = _between(rng, spread.mass)
-    m.drive = _between(rng, spread.stiffness)
-    m.drag = _between(rng, spread.damping_ratio) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
+    m.friction = _between(spread.friction, u[0])
+    m.torsion = _between(spread.torsion, u[1])
+    trials.mass[i] = _between(spread.mass, u[2])
+    m.drive = _between(spread.stiffness, u[3])
+    m.drag = _between(spread.damping_ratio, u[4]) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
     logarithms = wp.vec2(wp.log(spread.contact_stiffness[0]), wp.log(spread.contact_stiffness[1]))
-    m.contact = wp.exp(_between(rng, logarithms))
+    m.contact = wp.exp(_between(logarithms, u[5]))
     trials.material[i] = m
-    shift = _in_ball(rng, spread.shift)
-    error = _in_ball(rng, spread.turn)
+    shift = _in_ball(spread.shift, u[6], u[7], u[8])
+    error = _in_ball(spread.turn, u[9], u[10], u[11])
     s = Motion()
     s.pose = _turned(grasps.pose[row], course.com, wp.spatial_vector(shift, error))
     trials.start[i] = s.pose

@@ -9,7 +9,16 @@ import warp as wp
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hold.contacts import MAX_TOUCHES, Contact
-from lgrasp.hold.kernels import Course, Spread, TrialPulls, Trials, TriedGrasps, close_hands, pull_objects
+from lgrasp.hold.kernels import (
+    DRAWN_NUMBERS,
+    Course,
+    Spread,
+    TrialPulls,
+    Trials,
+    TriedGrasps,
+    close_hands,
+    pull_objects,
+)
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.solve import MAX_HAND_DOFS
 from lgrasp.object.arrays import ObjectArrays
@@ -26,7 +35,6 @@ _DRIVE_INERTIA = 4.0e-4  # [kg m^2] of a finger's joint, its drive and what it m
 _CONTACT_STIFFNESS = 2.0e4  # [N/m] of the trial without draws
 _BLOCK = 32  # threads of a block
 _MOST_TRIALS = 1 << 16  # at a time; each takes 4 KB
-_MIXER = 0x9E3779B9  # between the random streams of a row's draws
 
 
 @dataclass(frozen=True)
@@ -84,15 +92,15 @@ class HoldTester:
         """
         n, draws = len(postures), self._test.draws
         grasps = self._put(postures)
-        held, drift = self._try(grasps, np.arange(n), _nominal(), np.full(n, seed))
+        held, drift = self._try(grasps, np.arange(n), self._sown(_nominal(), seed), np.zeros(n, int))
         hits = np.zeros(n)
         active = np.flatnonzero(held) if least > 0.0 else np.arange(n)
         # a GPU is fast if it has much to do at once
         together = 1 if self._device == "cpu" else max(draws, 1)
+        spread = self._sown(_spread(self._test), seed)
         for first in range(0, draws, together):
-            streams = (seed + np.arange(first + 1, first + together + 1) * _MIXER) & 0x7FFFFFFF
             rows = np.repeat(active, together)
-            found = self._try(grasps, rows, _spread(self._test), np.tile(streams, len(active)))[0]
+            found = self._try(grasps, rows, spread, np.tile(np.arange(first, first + together), len(active)))[0]
             hits[active] += found.reshape(-1, together).sum(1)
             active = active[hits[active] + draws - first - together >= least * draws - 1e-6]
         probability = hits / draws if draws else held.astype(float)
@@ -115,18 +123,27 @@ class HoldTester:
             },
         )
 
-    def _try(self, grasps: Any, rows: np.ndarray, spread: Any, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whether each of some rows, with a seed each, holds (T,), and its displacement at worst (T,) [m]."""
+    def _sown(self, spread: Any, seed: int) -> Any:
+        """Ranges with a seed, and strata for all draws: of each number they have one in each of as many equal parts of
+        its range (Latin hypercube)."""
+        n = max(self._test.draws, 1)
+        order = np.random.default_rng(n).permuted(np.tile(np.arange(n), (int(DRAWN_NUMBERS), 1)), axis=1)
+        spread.seed = seed
+        spread.strata = wp.array((order.T / n).astype(np.float32), dtype=wp.float32, device=self._device)
+        return spread
+
+    def _try(self, grasps: Any, rows: np.ndarray, spread: Any, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whether each of some rows, in a draw each, holds (T,), and its displacement at worst (T,) [m]."""
         cuts = [slice(at, at + _MOST_TRIALS) for at in range(0, len(rows), _MOST_TRIALS)]
-        parts = [self._launch(grasps, rows[cut], spread, seeds[cut]) for cut in cuts]
+        parts = [self._launch(grasps, rows[cut], spread, draws[cut]) for cut in cuts]
         held, drift = zip(*parts, strict=True) if parts else ((np.zeros(0, bool),), (np.zeros(0),))
         return np.concatenate(held), np.concatenate(drift)
 
-    def _launch(self, grasps: Any, rows: np.ndarray, spread: Any, seeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _launch(self, grasps: Any, rows: np.ndarray, spread: Any, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         n, ways, device = len(rows), len(DIRECTIONS), self._device
         given = {
             "row": wp.array(rows.astype(np.int32), dtype=wp.int32, device=device),
-            "seed": wp.array(seeds.astype(np.int32), dtype=wp.int32, device=device),
+            "draw": wp.array(draws.astype(np.int32), dtype=wp.int32, device=device),
             "contacts": wp.empty((n, MAX_TOUCHES), dtype=Contact, device=device),
             "q": wp.empty((n, MAX_HAND_DOFS), dtype=wp.float32, device=device),
         }

@@ -117,25 +117,6 @@ def _factor(
         _solve(inertia, L, acceleration_out[w])
 
 
-@wp.kernel
-def _fill(rows: _Rows, inertia: _Inertia, scratch_out: _Scratch):
-    """Write the rows of friction and what they do; (W, R)."""
-    w, r = wp.tid()
-    if r >= rows.count[w] or rows.kinds[w, r] != rows.elliptic:
-        return
-    if rows.start[rows.contact[w, r], 0] == r:
-        return
-    J = scratch_out.jacobian[w, r]
-    Y = scratch_out.answer[w, r]
-    for i in range(J.shape[0]):
-        J[i] = 0.0
-        Y[i] = 0.0
-    for k in range(rows.first[w, r], rows.first[w, r] + rows.length[w, r]):
-        J[rows.column[w, 0, k]] = rows.value[w, 0, k]
-        Y[rows.column[w, 0, k]] = rows.value[w, 0, k]
-    _solve(inertia, scratch_out.factor[w], Y)
-
-
 @wp.func
 def _cheapest(A: wp.mat33, b: wp.vec3, mu: wp.vec3, normal: wp.float32):
     """The f of least 1/2 f A f + f b within |f / mu| <= normal."""
@@ -159,8 +140,25 @@ def _cheapest(A: wp.mat33, b: wp.vec3, mu: wp.vec3, normal: wp.float32):
 
 
 @lru_cache
-def sweeps_kernel(width: int) -> Any:
-    """The kernel for rows of ``width`` columns."""
+def noslip_kernels(width: int) -> tuple[Any, Any]:
+    """Two kernels for rows of ``width`` columns: what the rows do, and the sweeps."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def fill(rows: _Rows, inertia: _Inertia, scratch_out: _Scratch):
+        """Write the rows of friction and what they do; (W, R)."""
+        w, r = wp.tid()
+        if r >= rows.count[w] or rows.kinds[w, r] != rows.elliptic:
+            return
+        if rows.start[rows.contact[w, r], 0] == r:
+            return
+        x = wp.zeros(shape=(width,), dtype=wp.float32)
+        for k in range(rows.first[w, r], rows.first[w, r] + rows.length[w, r]):
+            x[rows.column[w, 0, k]] = rows.value[w, 0, k]
+        for i in range(width):
+            scratch_out.jacobian[w, r, i] = x[i]
+        _solve(inertia, scratch_out.factor[w], x)
+        for i in range(width):
+            scratch_out.answer[w, r, i] = x[i]
 
     @wp.kernel(module="unique", enable_backward=False)
     def sweep(rows: _Rows, scratch: _Scratch, iterations: wp.int32, acceleration_out: wp.array2d(dtype=wp.float32)):
@@ -218,7 +216,7 @@ def sweeps_kernel(width: int) -> Any:
                 r += ahead
         wp.tile_store(acceleration_out[w], a)
 
-    return sweep
+    return fill, sweep
 
 
 class NoSlip:
@@ -258,13 +256,13 @@ class NoSlip:
             jacobian=wp.empty((worlds, room, width), dtype=wp.float32),
             answer=wp.empty((worlds, room, width), dtype=wp.float32),
         )
-        self._sweep = sweeps_kernel(width)
+        self._fill, self._sweep = noslip_kernels(width)
 
     def run(self) -> None:
         """Change the friction that the solver found, and with it the accelerations ``qacc``."""
         d, scratch = self._d, self._scratch
         forces = [d.nefc, d.qfrc_smooth, d.qfrc_constraint]
         wp.launch(_factor, d.nworld, [self._inertia, *forces], [scratch, d.qacc])
-        wp.launch(_fill, (d.nworld, d.njmax), [self._rows, self._inertia], [scratch])
+        wp.launch(self._fill, (d.nworld, d.njmax), [self._rows, self._inertia], [scratch])
         inputs = [self._rows, scratch, self._iterations]
         wp.launch_tiled(self._sweep, dim=[d.nworld], inputs=inputs, outputs=[d.qacc], block_dim=_LANES)

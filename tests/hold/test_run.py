@@ -7,7 +7,7 @@ from support.holding import certain, press
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import ControlPoses, HoldTester
 
-FORCES = np.linspace(0.5, 4.0, 12)
+FORCES = np.linspace(0.5, 8.0, 12)
 TORSION = (0.0, 0.001)  # points do not stop a box from turning about them [m]
 
 
