@@ -2,14 +2,15 @@
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from lgrasp.errors import HandError
+from lgrasp.hand.couplings import drive_limits, find_drives, with_mimic
 from lgrasp.hand.spec import HandSpec
-from lgrasp.hand.urdf import Joint, Urdf, check_mimic
+from lgrasp.hand.urdf import Joint, Urdf
 from lgrasp.math.limits import DOF_SIZES, MAX_DOFS
 
 MAX_SETTINGS = 32
@@ -153,10 +154,10 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         HandError: spec names a joint or link that does not exist, or a locked or shared value is outside the limits.
     """
     stated = {j.name for j in urdf.joints if j.mimic is not None}
-    urdf = _with_mimic(urdf, spec)
+    urdf = with_mimic(urdf, spec)
     base = spec.base_link or urdf.root
     _check_names(urdf, spec, base)
-    drive = _drives(urdf)
+    drive = find_drives(urdf)
     fixed = {n: m * spec.locked[source] + b for n, (source, m, b) in drive.items() if source in spec.locked}
     # each link: the movable joint it rides on (None = static) and its pose in that joint's moving frame (or the root)
     rides: dict[str, tuple[str | None, np.ndarray]] = {urdf.root: (None, np.eye(4))}
@@ -203,7 +204,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         dof_first.append(len(dof_index))
         dof_free.append(len(place.keys() - shared))
     order = [j for members in groups for j in members]
-    lower, upper = _limits(actuated, moving, drive, spec)
+    lower, upper = drive_limits(actuated, moving, drive, spec)
     settings = _settings(spec, column, lower, upper)
     # joints that the URDF by itself would leave at 0: locked ones, and those that only hand.yaml couples
     unstated = [j for j in urdf.joints if j.mimic is not None and j.name not in stated]
@@ -264,31 +265,6 @@ def _check_names(urdf: Urdf, spec: HandSpec, base: str) -> None:
             raise HandError(f"hand '{spec.name}': '{link}' (static_links or fingers) is not a link of {urdf.path}")
     if base not in urdf.links:
         raise HandError(f"hand '{spec.name}': base_link '{base}' is not a link of {urdf.path}")
-
-
-def _with_mimic(urdf: Urdf, spec: HandSpec) -> Urdf:
-    """The URDF with the couplings that hand.yaml adds."""
-    by_name = {j.name: j for j in urdf.joints}
-    for name, coupling in spec.mimic.items():
-        for end in (name, coupling.joint):
-            if end not in by_name or not by_name[end].movable:
-                raise HandError(f"hand '{spec.name}': mimic names '{end}', not a movable joint of {urdf.path}")
-        given = by_name[name].mimic
-        wanted = (coupling.joint, coupling.multiplier, coupling.offset)
-        if given is not None and given != wanted:
-            raise HandError(
-                f"hand '{spec.name}': mimic couples '{name}' to {_coupling_text(wanted)}, but {urdf.path} couples it "
-                f"to {_coupling_text(given)}; leave it out of hand.yaml, or change the URDF"
-            )
-    joints = tuple(
-        replace(j, mimic=(m.joint, m.multiplier, m.offset)) if (m := spec.mimic.get(j.name)) else j for j in urdf.joints
-    )
-    check_mimic(urdf.path, joints)
-    return replace(urdf, joints=joints)
-
-
-def _coupling_text(mimic: tuple[str, float, float]) -> str:
-    return f"{mimic[1]:g} x '{mimic[0]}'" + (f" {mimic[2]:+g}" if mimic[2] else "")
 
 
 def _own_limits(joints: list[Joint]) -> np.ndarray:
@@ -366,38 +342,3 @@ def _group(
     for name in framing - set().union(*members.values()):
         first.update((name, *above(name)))
     return [[j for j in moving if j.name in names] for names in members.values()]
-
-
-def _drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
-    """Of each movable joint: the one behind it, with multiplier and offset composed along the mimic chain."""
-    by_name = {j.name: j for j in urdf.joints}
-    drives = {}
-    for joint in (j for j in urdf.joints if j.movable):
-        at, mult, offset = joint, 1.0, 0.0
-        while at.mimic is not None:
-            source, m, b = at.mimic
-            # x_at = m * x_source + b
-            at, mult, offset = by_name[source], mult * m, offset + mult * b
-        drives[joint.name] = (at.name, mult, offset)
-    return drives
-
-
-def _limits(
-    actuated: list[Joint], moving: list[Joint], drive: dict[str, tuple[str, float, float]], spec: HandSpec
-) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of the actuated joints [rad or m], narrowed so that every mimic joint stays inside its own."""
-    limits = {j.name: (j.lower, j.upper) for j in actuated}
-    for j in moving:
-        source, mult, offset = drive[j.name]
-        if j.mimic is None or mult == 0.0:
-            continue
-        a, b = sorted(((j.lower - offset) / mult, (j.upper - offset) / mult))
-        limits[source] = max(limits[source][0], a), min(limits[source][1], b)
-    for name, (lower, upper) in limits.items():
-        if lower >= upper:
-            raise HandError(
-                f"hand '{spec.name}': joint '{name}' has no room left; the limits of the joints that mimic it "
-                "exclude each other"
-            )
-    lower, upper = np.array(list(limits.values())).T
-    return lower, upper

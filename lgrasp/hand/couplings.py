@@ -1,0 +1,77 @@
+"""Joints that follow others: the couplings of a URDF and of hand.yaml."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lgrasp.errors import HandError
+from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.urdf import Joint, Urdf, check_mimic
+
+
+def with_mimic(urdf: Urdf, spec: HandSpec) -> Urdf:
+    """The URDF with the couplings that hand.yaml adds.
+
+    Raises:
+        HandError: one names a joint that does not exist or move, or contradicts the URDF.
+    """
+    by_name = {j.name: j for j in urdf.joints}
+    for name, coupling in spec.mimic.items():
+        for end in (name, coupling.joint):
+            if end not in by_name or not by_name[end].movable:
+                raise HandError(f"hand '{spec.name}': mimic names '{end}', not a movable joint of {urdf.path}")
+        given = by_name[name].mimic
+        wanted = (coupling.joint, coupling.multiplier, coupling.offset)
+        if given is not None and given != wanted:
+            raise HandError(
+                f"hand '{spec.name}': mimic couples '{name}' to {_coupling_text(wanted)}, but {urdf.path} couples it "
+                f"to {_coupling_text(given)}; leave it out of hand.yaml, or change the URDF"
+            )
+    joints = tuple(
+        replace(j, mimic=(m.joint, m.multiplier, m.offset)) if (m := spec.mimic.get(j.name)) else j for j in urdf.joints
+    )
+    check_mimic(urdf.path, joints)
+    return replace(urdf, joints=joints)
+
+
+def _coupling_text(mimic: tuple[str, float, float]) -> str:
+    return f"{mimic[1]:g} x '{mimic[0]}'" + (f" {mimic[2]:+g}" if mimic[2] else "")
+
+
+def find_drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
+    """Of each movable joint: the one behind it, with multiplier and offset composed along the mimic chain."""
+    by_name = {j.name: j for j in urdf.joints}
+    drives = {}
+    for joint in (j for j in urdf.joints if j.movable):
+        at, mult, offset = joint, 1.0, 0.0
+        while at.mimic is not None:
+            source, m, b = at.mimic
+            # x_at = m * x_source + b
+            at, mult, offset = by_name[source], mult * m, offset + mult * b
+        drives[joint.name] = (at.name, mult, offset)
+    return drives
+
+
+def drive_limits(
+    actuated: list[Joint], moving: list[Joint], drive: dict[str, tuple[str, float, float]], spec: HandSpec
+) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of the actuated joints [rad or m], narrowed so that every mimic joint stays inside its own.
+
+    Raises:
+        HandError: nothing is left of them.
+    """
+    limits = {j.name: (j.lower, j.upper) for j in actuated}
+    for j in moving:
+        source, mult, offset = drive[j.name]
+        if j.mimic is None or mult == 0.0:
+            continue
+        a, b = sorted(((j.lower - offset) / mult, (j.upper - offset) / mult))
+        limits[source] = max(limits[source][0], a), min(limits[source][1], b)
+    for name, (lower, upper) in limits.items():
+        if lower >= upper:
+            raise HandError(
+                f"hand '{spec.name}': joint '{name}' has no room left; the limits of the joints that mimic it "
+                "exclude each other"
+            )
+    lower, upper = np.array(list(limits.values())).T
+    return lower, upper
