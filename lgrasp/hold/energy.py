@@ -14,7 +14,7 @@ between them too. E is convex as long as f_c is held.
 import warp as wp
 
 from lgrasp.hand.arrays import Hand
-from lgrasp.hold.contacts import Contact
+from lgrasp.hold.scratch import Contact, Scratch
 from lgrasp.math.kinematics import point_column
 from lgrasp.math.limits import MAX_DOFS
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -49,29 +49,22 @@ class Body:
 
 
 @wp.func
-def make_columns(
-    hand: Hand,
-    X: wp.array(dtype=wp.transform),
-    contacts: wp.array(dtype=Contact),
-    count: wp.int32,
-    column: wp.array(dtype=wp.vec3),
-    spin: wp.array(dtype=wp.float32),
-):
+def make_columns(hand: Hand, w: Scratch, count: wp.int32):
     """Motion of each contact's point on its link [m], and its turn about the normal [rad], per unit of each dof."""
-    for c in range(count):
+    for c in range(w.lane, count, w.lanes):
         for d in range(MAX_DOFS):
-            column[c * MAX_DOFS + d] = wp.vec3(0.0)
-            spin[c * MAX_DOFS + d] = 0.0
-        b = contacts[c].body
+            w.column[c * MAX_DOFS + d] = wp.vec3(0.0)
+            w.spin[c * MAX_DOFS + d] = 0.0
+        b = w.contacts[c].body
         if b > 0:
             j0 = hand.kin.joint_first[hand.body_group[b]]
             a = b - 1 - j0
             while a >= 0:
                 d = hand.kin.joint_dof[j0 + a]
-                column[c * MAX_DOFS + d] += point_column(hand.kin, j0 + a, X[j0 + a], contacts[c].point)
+                w.column[c * MAX_DOFS + d] += point_column(hand.kin, j0 + a, w.X[j0 + a], w.contacts[c].point)
                 if hand.kin.joint_prismatic[j0 + a] == 0:
-                    axis = wp.transform_vector(X[j0 + a], hand.kin.joint_axis[j0 + a])
-                    spin[c * MAX_DOFS + d] += hand.kin.joint_mult[j0 + a] * wp.dot(axis, contacts[c].normal)
+                    axis = wp.transform_vector(w.X[j0 + a], hand.kin.joint_axis[j0 + a])
+                    w.spin[c * MAX_DOFS + d] += hand.kin.joint_mult[j0 + a] * wp.dot(axis, w.contacts[c].normal)
                 a = hand.kin.joint_parent[j0 + a]
 
 

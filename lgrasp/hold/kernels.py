@@ -3,18 +3,18 @@
 import warp as wp
 
 from lgrasp.hand.arrays import Hand
-from lgrasp.hold.contacts import MAX_TOUCHES, Contact, find_contacts, follow_contacts
+from lgrasp.hold.contacts import find_contacts, follow_contacts
 from lgrasp.hold.energy import Body, Material, make_columns
-from lgrasp.hold.solve import MAX_HAND_DOFS, solve_step
+from lgrasp.hold.scratch import MAX_HAND_DOFS, Contact, Scratch, Scratches, scratch_of
+from lgrasp.hold.solve import solve_step
 from lgrasp.math.constants import SLIDING_ARM
 from lgrasp.math.kinematics import group_forward, vec_dof
-from lgrasp.math.limits import MAX_BODIES, MAX_DOFS
+from lgrasp.math.lanes import lanes_least, lanes_max, meet
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_COLUMNS = MAX_TOUCHES * MAX_DOFS
 _REACH = wp.constant(2.0e-3)  # [m] contacts are looked for within
 DRAWN_NUMBERS = wp.constant(12)
 """That a trial has, of the ranges of :class:`Spread` in turn, three each of ``shift`` and ``turn``."""
@@ -100,6 +100,15 @@ class TrialPulls:
     displacement: wp.array2d(dtype=wp.float32)  # (T, 6) at worst, closing included [m]; 0 not tried
 
 
+@wp.struct
+class Workers:
+    """Lanes that take one trial after another; W workers."""
+
+    lanes: wp.int32  # of a worker
+    queue: wp.array(dtype=wp.int32)  # (1,) how many trials were taken
+    scratch: Scratches  # W of it
+
+
 @wp.func
 def _share(rng: wp.uint32, spread: Spread, draw: wp.int32, number: wp.int32):
     """Where in its range a number is: the strata of a grasp's draws, all moved on by as much, round and round."""
@@ -162,76 +171,59 @@ def _body(course: Course, s: Motion, mass: wp.float32, h: wp.float32, pull: wp.i
 
 
 @wp.func
-def _aim(
-    hand: Hand,
-    grasps: TriedGrasps,
-    row: wp.int32,
-    phase: wp.int32,
-    share: wp.float32,
-    target: wp.array(dtype=wp.float32),
-):
+def _aim(hand: Hand, grasps: TriedGrasps, row: wp.int32, phase: wp.int32, share: wp.float32, w: Scratch):
     """Targets of the drives: phase 0 from pregrasp to grasp, 1 from grasp to squeeze, later the squeeze."""
-    for k in range(hand.kin.dof_first[hand.kin.groups]):
+    for k in range(w.lane, hand.kin.dof_first[hand.kin.groups], w.lanes):
         at = hand.kin.dof_index[k]
         b = grasps.grasp[row, at]
         if phase == 0:
             a = grasps.pregrasp[row, at]
-            target[k] = a + share * (b - a)
+            w.target[k] = a + share * (b - a)
         else:
             c = grasps.squeeze[row, at]
-            target[k] = wp.where(phase == 1, b + share * (c - b), c)
+            w.target[k] = wp.where(phase == 1, b + share * (c - b), c)
 
 
 @wp.func
-def _place(hand: Hand, q: wp.array(dtype=wp.float32), X: wp.array(dtype=wp.transform)):
+def _place(hand: Hand, w: Scratch):
     """Write the pose of every moving body."""
-    for g in range(hand.kin.groups):
+    for g in range(w.lane, hand.kin.groups, w.lanes):
         v = vec_dof()
         first = hand.kin.dof_first[g]
         for d in range(hand.kin.dof_first[g + 1] - first):
-            v[d] = q[first + d]
-        group_forward(hand.kin, g, v, X, hand.kin.joint_first[g])
+            v[d] = w.q[first + d]
+        group_forward(hand.kin, g, v, w.X, hand.kin.joint_first[g])
 
 
 @wp.func
-def _copy(contacts: wp.array(dtype=Contact), count: wp.int32, out: wp.array(dtype=Contact)):
-    for c in range(count):
-        out[c] = contacts[c]
-
-
-@wp.func
-def _scales(hand: Hand, scale: wp.array(dtype=wp.float32)):
-    """Write the stiffness of each joint over that of a revolute one; copies of a shared joint have it together."""
+def _describe(hand: Hand, w: Scratch):
+    """Write the group of each dof, and its stiffness over that of a revolute joint; copies of a shared joint have it
+    together."""
     dofs = hand.kin.dof_first[hand.kin.groups]
-    for g in range(hand.kin.groups):
-        first = hand.kin.dof_first[g]
-        for d in range(hand.kin.dof_first[g + 1] - first):
-            scale[first + d] = 1.0
+    for k in range(w.lane, dofs, w.lanes):
+        g = int(0)
+        while hand.kin.dof_first[g + 1] <= k:
+            g += 1
+        w.group[k] = g
+        stiff = float(1.0)
         for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-            if hand.kin.joint_prismatic[j] == 1:
-                scale[first + hand.kin.joint_dof[j]] = 1.0 / (SLIDING_ARM * SLIDING_ARM)
-    for k in range(dofs):
+            if hand.kin.joint_dof[j] == k - hand.kin.dof_first[g] and hand.kin.joint_prismatic[j] == 1:
+                stiff = 1.0 / (SLIDING_ARM * SLIDING_ARM)
         copies = float(0.0)
         for o in range(dofs):
             if hand.kin.dof_index[o] == hand.kin.dof_index[k]:
                 copies += 1.0
-        scale[k] = scale[k] / copies
+        w.scale[k] = stiff / copies
 
 
 @wp.func
-def _advance(
-    hand: Hand,
-    scale: wp.array(dtype=wp.float32),
-    q: wp.array(dtype=wp.float32),
-    dq: wp.array(dtype=wp.float32),
-    dx: wp.spatial_vector,
-):
+def _advance(hand: Hand, dx: wp.spatial_vector, w: Scratch):
     """Move the joints; returns how far points of hand and object have come [m], roughly."""
     far = wp.max(wp.length(wp.spatial_top(dx)), 0.5 * SLIDING_ARM * wp.length(wp.spatial_bottom(dx)))
-    for k in range(hand.kin.dof_first[hand.kin.groups]):
-        q[k] = q[k] + dq[k]
-        far = wp.max(far, SLIDING_ARM * wp.abs(dq[k]) * wp.sqrt(scale[k]))
-    return far
+    for k in range(w.lane, hand.kin.dof_first[hand.kin.groups], w.lanes):
+        w.q[k] = w.q[k] + w.dq[k]
+        far = wp.max(far, SLIDING_ARM * wp.abs(w.dq[k]) * wp.sqrt(w.scale[k]))
+    return lanes_max(far)
 
 
 @wp.func
@@ -244,51 +236,51 @@ def _go(
     i: wp.int32,
     phase: wp.int32,
     s: Motion,
-    q: wp.array(dtype=wp.float32),
-    contacts: wp.array(dtype=Contact),
-    scale: wp.array(dtype=wp.float32),
+    w: Scratch,
 ):
     """Take trial i through a phase: 0 to the grasp, 1 to the squeeze, 2 ... 7 pulls; returns its motion at the end."""
-    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    before = wp.zeros(shape=(MAX_TOUCHES,), dtype=Contact)
-    column = wp.zeros(shape=(_COLUMNS,), dtype=wp.vec3)
-    spin = wp.zeros(shape=(_COLUMNS,), dtype=wp.float32)
-    dq = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    target = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
     pull = phase - 2
     steps = wp.where(pull < 0, course.closing_steps, course.pull_steps)
     h = wp.where(pull < 0, course.closing_time, course.pull_time)
     m = trials.material[i]
     m.drag = m.drag / h
     travel = float(1.0e9)
-    over = int(0)
     for step in range(steps):
-        if over == 0:
-            _aim(hand, grasps, trials.row[i], phase, float(step + 1) / float(steps), target)
-            _place(hand, q, X)
-            if travel > _TRAVEL:
-                _copy(contacts, s.contacts, before)
-                s.contacts = find_contacts(hand, obj, X, s.pose, _REACH, before, s.contacts, contacts)
-                travel = 0.0
-            else:
-                follow_contacts(hand, obj, X, s.pose, contacts, s.contacts)
-            make_columns(hand, X, contacts, s.contacts, column, spin)
-            body = _body(course, s, trials.mass[i], h, pull)
-            dx = solve_step(hand, m, body, contacts, s.contacts, column, spin, scale, q, target, dq)
-            travel += _advance(hand, scale, q, dq, dx)
-            s.velocity = dx / h
-            s.pose = _turned(s.pose, course.com, dx)
-            s, shift, turn = _note(course, s, trials.start[i])
-            if s.lost == 1:
-                over = 1
-            elif pull >= 0 and step >= 2:
-                # at four times this speed it stays well inside the bounds to the end
-                ahead = 4.0 * float(steps - 1 - step)
-                slide = shift + ahead * wp.length(wp.spatial_top(dx))
-                roll = turn + ahead * wp.length(wp.spatial_bottom(dx))
-                if slide < 0.5 * course.most_displacement and roll < 0.5 * course.most_rotation:
-                    over = 1
+        _aim(hand, grasps, trials.row[i], phase, float(step + 1) / float(steps), w)
+        _place(hand, w)
+        meet()
+        if travel > _TRAVEL:
+            s.contacts = find_contacts(hand, obj, w, s.pose, _REACH, s.contacts)
+            travel = 0.0
+        else:
+            follow_contacts(hand, obj, w, s.pose, s.contacts)
+        make_columns(hand, w, s.contacts)
+        body = _body(course, s, trials.mass[i], h, pull)
+        dx = solve_step(hand, m, body, s.contacts, w)
+        travel += _advance(hand, dx, w)
+        meet()
+        s.velocity = dx / h
+        s.pose = _turned(s.pose, course.com, dx)
+        s, shift, turn = _note(course, s, trials.start[i])
+        if s.lost == 1:
+            break
+        if pull >= 0 and step >= 2:
+            # at four times this speed it stays well inside the bounds to the end
+            ahead = 4.0 * float(steps - 1 - step)
+            slide = shift + ahead * wp.length(wp.spatial_top(dx))
+            roll = turn + ahead * wp.length(wp.spatial_bottom(dx))
+            if slide < 0.5 * course.most_displacement and roll < 0.5 * course.most_rotation:
+                break
     return s
+
+
+@wp.func
+def _next(queue: wp.array(dtype=wp.int32), w: Scratch):
+    """Number of the next thing to do, the same in all lanes."""
+    number = int(0x7FFFFFFF)
+    if w.lane == 0:
+        number = wp.atomic_add(queue, 0, 1)
+    return lanes_least(number)
 
 
 @wp.kernel
@@ -298,46 +290,54 @@ def close_hands(
     course: Course,
     spread: Spread,
     grasps: TriedGrasps,
+    workers: Workers,
     trials: Trials,
 ):
-    """One thread per trial: draw its numbers and close the hand on the object.
+    """Lanes of a worker, each time with the next trial: draw its numbers and close the hand on the object.
 
     Args:
         trials: ``row`` and ``draw`` are given, all else is written.
     """
-    i = wp.tid()
-    row = trials.row[i]
-    contacts = wp.zeros(shape=(MAX_TOUCHES,), dtype=Contact)
-    scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    q = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    rng = wp.rand_init(spread.seed, grasps.number[row])
-    u = vec_numbers()
-    for k in range(DRAWN_NUMBERS):
-        u[k] = _share(rng, spread, trials.draw[i], k)
-    m = Material()
-    m.friction = _between(spread.friction, u[0])
-    m.torsion = _between(spread.torsion, u[1])
-    trials.mass[i] = _between(spread.mass, u[2])
-    m.drive = _between(spread.stiffness, u[3])
-    m.drag = _between(spread.damping_ratio, u[4]) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
-    logarithms = wp.vec2(wp.log(spread.contact_stiffness[0]), wp.log(spread.contact_stiffness[1]))
-    m.contact = wp.exp(_between(logarithms, u[5]))
-    trials.material[i] = m
-    shift = _in_ball(spread.shift, u[6], u[7], u[8])
-    error = _in_ball(spread.turn, u[9], u[10], u[11])
-    s = Motion()
-    s.pose = _turned(grasps.pose[row], course.com, wp.spatial_vector(shift, error))
-    trials.start[i] = s.pose
-    _scales(hand, scale)
-    _aim(hand, grasps, row, 0, 0.0, q)
-    for phase in range(2):
-        if s.lost == 0:
-            s = _go(hand, obj, course, grasps, trials, i, phase, s, q, contacts, scale)
-    trials.motion[i] = s
-    for c in range(s.contacts):
-        trials.contacts[i, c] = contacts[c]
-    for k in range(MAX_HAND_DOFS):
-        trials.q[i, k] = q[k]
+    worker, lane = wp.tid()
+    w = scratch_of(workers.scratch, worker, lane, workers.lanes)
+    _describe(hand, w)
+    i = _next(workers.queue, w)
+    while i < trials.row.shape[0]:
+        row = trials.row[i]
+        rng = wp.rand_init(spread.seed, grasps.number[row])
+        u = vec_numbers()
+        for k in range(DRAWN_NUMBERS):
+            u[k] = _share(rng, spread, trials.draw[i], k)
+        m = Material()
+        m.friction = _between(spread.friction, u[0])
+        m.torsion = _between(spread.torsion, u[1])
+        mass = _between(spread.mass, u[2])
+        m.drive = _between(spread.stiffness, u[3])
+        m.drag = _between(spread.damping_ratio, u[4]) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
+        logarithms = wp.vec2(wp.log(spread.contact_stiffness[0]), wp.log(spread.contact_stiffness[1]))
+        m.contact = wp.exp(_between(logarithms, u[5]))
+        shift = _in_ball(spread.shift, u[6], u[7], u[8])
+        error = _in_ball(spread.turn, u[9], u[10], u[11])
+        s = Motion()
+        s.pose = _turned(grasps.pose[row], course.com, wp.spatial_vector(shift, error))
+        if lane == 0:
+            trials.mass[i] = mass
+            trials.material[i] = m
+            trials.start[i] = s.pose
+        for k in range(lane, hand.kin.dof_first[hand.kin.groups], workers.lanes):
+            w.q[k] = grasps.pregrasp[row, hand.kin.dof_index[k]]
+        meet()
+        for phase in range(2):
+            if s.lost == 0:
+                s = _go(hand, obj, course, grasps, trials, i, phase, s, w)
+        if lane == 0:
+            trials.motion[i] = s
+        for c in range(lane, s.contacts, workers.lanes):
+            trials.contacts[i, c] = w.contacts[c]
+        for k in range(lane, MAX_HAND_DOFS, workers.lanes):
+            trials.q[i, k] = w.q[k]
+        meet()
+        i = _next(workers.queue, w)
 
 
 @wp.kernel
@@ -348,22 +348,31 @@ def pull_objects(
     grasps: TriedGrasps,
     trials: Trials,
     each: wp.int32,
+    workers: Workers,
     pulls_out: TrialPulls,
 ):
-    """One thread per trial and run of ``each`` directions, which ends at the first that is not held."""
-    i, part = wp.tid()
-    contacts = wp.zeros(shape=(MAX_TOUCHES,), dtype=Contact)
-    scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    q = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
-    _scales(hand, scale)
-    s = trials.motion[i]
-    for pull in range(part * each, (part + 1) * each):
-        if s.lost == 0:
-            s = trials.motion[i]
-            for c in range(s.contacts):
-                contacts[c] = trials.contacts[i, c]
-            for k in range(MAX_HAND_DOFS):
-                q[k] = trials.q[i, k]
-            s = _go(hand, obj, course, grasps, trials, i, 2 + pull, s, q, contacts, scale)
-            pulls_out.held[i, pull] = 1 - s.lost
-            pulls_out.displacement[i, pull] = s.displacement
+    """Lanes of a worker, each time with the next trial and run of ``each`` directions, which ends at the first that is
+    not held."""
+    worker, lane = wp.tid()
+    w = scratch_of(workers.scratch, worker, lane, workers.lanes)
+    _describe(hand, w)
+    runs = 6 // each
+    number = _next(workers.queue, w)
+    while number < runs * trials.row.shape[0]:
+        i = number // runs
+        first = number % runs * each
+        s = trials.motion[i]
+        for pull in range(first, first + each):
+            if s.lost == 0:
+                s = trials.motion[i]
+                for c in range(lane, s.contacts, workers.lanes):
+                    w.contacts[c] = trials.contacts[i, c]
+                for k in range(lane, MAX_HAND_DOFS, workers.lanes):
+                    w.q[k] = trials.q[i, k]
+                meet()
+                s = _go(hand, obj, course, grasps, trials, i, 2 + pull, s, w)
+                if lane == 0:
+                    pulls_out.held[i, pull] = 1 - s.lost
+                    pulls_out.displacement[i, pull] = s.displacement
+        meet()
+        number = _next(workers.queue, w)

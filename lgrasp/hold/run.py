@@ -8,7 +8,6 @@ import warp as wp
 
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hold.contacts import MAX_TOUCHES, Contact
 from lgrasp.hold.kernels import (
     DRAWN_NUMBERS,
     Course,
@@ -16,11 +15,13 @@ from lgrasp.hold.kernels import (
     TrialPulls,
     Trials,
     TriedGrasps,
+    Workers,
     close_hands,
     pull_objects,
 )
 from lgrasp.hold.params import HoldTest
-from lgrasp.hold.solve import MAX_HAND_DOFS
+from lgrasp.hold.scratch import MAX_HAND_DOFS, MAX_TOUCHES, Contact, empty_scratches
+from lgrasp.math.lanes import LANES
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.object.mass import mass_properties
 from lgrasp.runtime.fetch import fetch
@@ -33,7 +34,7 @@ METRICS = ("hold_success", "hold_probability", "hold_drift")
 _CLOSING_STEPS, _PULL_STEPS = 10, 40
 _DRIVE_INERTIA = 4.0e-4  # [kg m^2] of a finger's joint, its drive and what it moves
 _CONTACT_STIFFNESS = 2.0e4  # [N/m] of the trial without draws
-_BLOCK = 32  # threads of a block
+_WORKERS = 1 << 12  # on a GPU: more than it has place for at a time
 _MOST_TRIALS = 1 << 16  # at a time; each takes 4 KB
 
 
@@ -152,11 +153,17 @@ class HoldTester:
         displacement = wp.zeros((n, ways), dtype=wp.float32, device=device)
         pulls = make_struct(TrialPulls, held=held, displacement=displacement)
         both = [self._hand.struct, self._object.struct, self._course]
-        # on a GPU short blocks spread few long threads over all of it, and every thread pulls one way only
-        each = ways if device == "cpu" else 1
-        wp.launch(close_hands, n, [*both, spread, grasps, trials], device=device, block_dim=_BLOCK)
-        dim = (n, ways // each)
-        wp.launch(pull_objects, dim, [*both, grasps, trials, each], [pulls], device=device, block_dim=_BLOCK)
+        # on a GPU every worker pulls one way only
+        each, lanes, most = (ways, 1, 1) if device == "cpu" else (1, LANES, _WORKERS)
+        runs = n * (ways // each)
+        scratch = empty_scratches(min(runs, most), device)
+        closing, pulling = (
+            make_struct(Workers, lanes=lanes, scratch=scratch, queue=wp.zeros(1, dtype=wp.int32, device=device))
+            for _ in range(2)
+        )
+        how = {"device": device, "block_dim": LANES}
+        wp.launch(close_hands, (min(n, most), lanes), [*both, spread, grasps, closing, trials], **how)
+        wp.launch(pull_objects, (min(runs, most), lanes), [*both, grasps, trials, each, pulling], [pulls], **how)
         stayed, moved = fetch([held, displacement])
         return np.all(stayed, axis=1), np.max(moved, axis=1)
 

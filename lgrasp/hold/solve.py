@@ -3,7 +3,6 @@
 import warp as wp
 
 from lgrasp.hand.arrays import Hand
-from lgrasp.hold.contacts import MAX_TOUCHES, Contact
 from lgrasp.hold.energy import (
     LIMIT,
     Body,
@@ -13,25 +12,26 @@ from lgrasp.hold.energy import (
     relative_motion,
     twist_stiffness,
 )
+from lgrasp.hold.scratch import OBJECT_TERMS, Scratch
 from lgrasp.hold.system import (
-    add_contact,
-    clear_rows,
-    eliminate_finger,
+    GRADIENT,
+    clear_row,
+    contact_terms,
+    factor_block,
     gather_shared,
     give_shared,
+    object_place,
+    reduce_column,
+    reduce_object,
+    set_row,
     solve_finger,
     solve_object,
 )
-from lgrasp.math.limits import MAX_DOFS, MAX_GROUPS
+from lgrasp.math.lanes import lanes_max, lanes_sum, meet
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-MAX_HAND_DOFS = MAX_GROUPS * MAX_DOFS
-"""Most dofs of all groups together."""
-_ROWS = MAX_HAND_DOFS + MAX_DOFS  # those of the shared joints come last
-_BLOCKS = _ROWS * MAX_DOFS
-_COUPLING = _ROWS * 7
 _ITERATIONS = wp.constant(12)
 _STOP = wp.constant(1.0e-8)  # [J]
 _FORCE_STOP = wp.constant(0.02)  # [N]
@@ -39,43 +39,85 @@ _SEARCH = wp.constant(10)  # points tried along a step
 
 
 @wp.func
-def _add_own(
-    hand: Hand,
-    m: Material,
-    body: Body,
-    scale: wp.array(dtype=wp.float32),
-    q: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    dq: wp.array(dtype=wp.float32),
-    dx: wp.spatial_vector,
-    A: wp.array(dtype=wp.float32),
-    B: wp.array(dtype=wp.float32),
-):
-    """Begin a system with the drives and the object by itself; returns C and g of the object."""
+def _assemble(hand: Hand, m: Material, body: Body, count: wp.int32, dx: wp.spatial_vector, w: Scratch):
+    """Write the system at the motion so far, and its gradient by the joints to ``step``."""
+    for c in range(w.lane, count, w.lanes):
+        w.terms[c] = contact_terms(m, body.com, w.contacts[c], w.Y[c], c * OBJECT_TERMS, w.on_object)
+    meet()
     end = hand.kin.dof_first[hand.kin.groups]
-    clear_rows(0, end + hand.kin.shared, A, B)
-    for group in range(hand.kin.groups):
+    for k in range(w.lane, end, w.lanes):
+        group = w.group[k]
+        drag = m.drag * w.scale[k]
+        stiff = m.drive * w.scale[k]
+        over = beyond_limits(hand, k, w.q[k] + w.dq[k])
+        slope = stiff * (w.q[k] + w.dq[k] - w.target[k] + LIMIT * over) + drag * w.dq[k]
+        if over != 0.0:
+            stiff += LIMIT * stiff
+        set_row(hand, count, group, k - hand.kin.dof_first[group], stiff + drag, slope, w)
+    for k in range(end + w.lane, end + hand.kin.shared, w.lanes):
+        clear_row(k, w)
+    for e in range(w.lane, OBJECT_TERMS, w.lanes):
+        s = float(0.0)
+        for c in range(count):
+            s += w.on_object[c * OBJECT_TERMS + e]
+        w.C[e] = s
+    meet()
+    if w.lane == 0:
+        r = dx - body.free
+        by_turn = body.inertia * wp.spatial_bottom(r)
+        for a in range(3):
+            w.C[object_place(a, a)] += body.mass
+            w.C[GRADIENT + a] += body.mass * r[a] - body.force[a]
+            w.C[GRADIENT + 3 + a] += by_turn[a]
+            for b in range(a + 1):
+                w.C[object_place(3 + a, 3 + b)] += body.inertia[a, b]
+        for a in range(6):
+            w.g[a] = w.C[GRADIENT + a]
+    meet()
+
+
+@wp.func
+def _solve(hand: Hand, w: Scratch):
+    """Step of the object that the system asks for, and the slope of the energy along it and along ``step``, which is
+    written."""
+    groups = hand.kin.groups
+    dofs = hand.kin.dof_first[groups]
+    shared = hand.kin.shared
+    for group in range(w.lane, groups, w.lanes):
         first = hand.kin.dof_first[group]
-        for d in range(hand.kin.dof_first[group + 1] - first):
-            k = first + d
-            stiff = m.drive * scale[k]
-            drag = m.drag * scale[k]
-            over = beyond_limits(hand, k, q[k] + dq[k])
-            B[k * 7 + 6] = stiff * (q[k] + dq[k] - target[k] + LIMIT * over) + drag * dq[k]
-            A[k * MAX_DOFS + d] = stiff + drag
-            if over != 0.0:
-                A[k * MAX_DOFS + d] += LIMIT * stiff
-    C = wp.spatial_matrix()
-    g = wp.spatial_vector()
-    r = dx - body.free
-    w = body.inertia * wp.spatial_bottom(r)
-    for a in range(3):
-        C[a, a] = body.mass
-        g[a] = body.mass * r[a] - body.force[a]
-        g[3 + a] = w[a]
-        for b in range(3):
-            C[3 + a, 3 + b] = body.inertia[a, b]
-    return C, g
+        factor_block(first, hand.kin.dof_free[group], hand.kin.dof_first[group + 1] - first, w.A)
+    meet()
+    for i in range(w.lane, groups * 7, w.lanes):
+        group = i // 7
+        first = hand.kin.dof_first[group]
+        members = hand.kin.dof_first[group + 1] - first
+        reduce_column(first, hand.kin.dof_free[group], members, i % 7, w.A, w.B)
+    meet()
+    if shared > 0:
+        if w.lane == 0:
+            for group in range(groups):
+                gather_shared(hand, group, w)
+            factor_block(dofs, shared, shared, w.A)
+        meet()
+        for col in range(w.lane, 7, w.lanes):
+            reduce_column(dofs, shared, shared, col, w.A, w.B)
+        meet()
+    reduce_object(hand, w)
+    meet()
+    move = solve_object(w.C)
+    slope = float(0.0)
+    if w.lane == 0:
+        for a in range(6):
+            slope += w.g[a] * move[a]
+        slope += solve_finger(dofs, shared, shared, move, w.A, w.B, w.step)
+    meet()
+    for group in range(w.lane, groups, w.lanes):
+        first = hand.kin.dof_first[group]
+        give_shared(hand, group, w)
+        members = hand.kin.dof_first[group + 1] - first
+        slope += solve_finger(first, hand.kin.dof_free[group], members, move, w.A, w.B, w.step)
+    meet()
+    return move, lanes_sum(slope)
 
 
 @wp.func
@@ -83,32 +125,28 @@ def _share_of_step(
     hand: Hand,
     m: Material,
     body: Body,
-    contacts: wp.array(dtype=Contact),
     count: wp.int32,
-    Y: wp.array(dtype=wp.vec4),
-    Z: wp.array(dtype=wp.vec4),
-    scale: wp.array(dtype=wp.float32),
-    q: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    dq: wp.array(dtype=wp.float32),
-    step: wp.array(dtype=wp.float32),
     dx: wp.spatial_vector,
     move: wp.spatial_vector,
     slope: wp.float32,
+    w: Scratch,
 ):
     """Share of a step after which the energy rises again: where its slope, which only rises, passes zero; 1 at most."""
-    turn = wp.spatial_bottom(move)
-    w = body.inertia * turn
-    r = dx - body.free
-    first = wp.dot(w, wp.spatial_bottom(r)) - wp.dot(body.force, wp.spatial_top(move))
-    first += body.mass * wp.dot(wp.spatial_top(move), wp.spatial_top(r))
-    rise = wp.dot(w, turn) + body.mass * wp.dot(wp.spatial_top(move), wp.spatial_top(move))
+    first = float(0.0)
+    rise = float(0.0)
+    if w.lane == 0:
+        turn = wp.spatial_bottom(move)
+        by_turn = body.inertia * turn
+        r = dx - body.free
+        first = wp.dot(by_turn, wp.spatial_bottom(r)) - wp.dot(body.force, wp.spatial_top(move))
+        first += body.mass * wp.dot(wp.spatial_top(move), wp.spatial_top(r))
+        rise = wp.dot(by_turn, turn) + body.mass * wp.dot(wp.spatial_top(move), wp.spatial_top(move))
     dofs = hand.kin.dof_first[hand.kin.groups]
-    for k in range(dofs):
-        stiff = m.drive * scale[k]
-        drag = m.drag * scale[k]
-        first += step[k] * (stiff * (q[k] + dq[k] - target[k]) + drag * dq[k])
-        rise += step[k] * step[k] * (stiff + drag)
+    for k in range(w.lane, dofs, w.lanes):
+        stiff = m.drive * w.scale[k]
+        drag = m.drag * w.scale[k]
+        first += w.step[k] * (stiff * (w.q[k] + w.dq[k] - w.target[k]) + drag * w.dq[k])
+        rise += w.step[k] * w.step[k] * (stiff + drag)
     low = float(0.0)
     high = float(1.0)
     slope_low = slope
@@ -116,11 +154,12 @@ def _share_of_step(
     share = float(1.0)
     for attempt in range(_SEARCH):
         here = first + share * rise
-        for c in range(count):
-            here += contact_slope(m, contacts[c], Y[c] + Z[c] * share, Z[c])
-        for k in range(dofs):
-            over = beyond_limits(hand, k, q[k] + dq[k] + share * step[k])
-            here += LIMIT * m.drive * scale[k] * over * step[k]
+        for c in range(w.lane, count, w.lanes):
+            here += contact_slope(m, w.contacts[c], w.Y[c] + w.Z[c] * share, w.Z[c])
+        for k in range(w.lane, dofs, w.lanes):
+            over = beyond_limits(hand, k, w.q[k] + w.dq[k] + share * w.step[k])
+            here += LIMIT * m.drive * w.scale[k] * over * w.step[k]
+        here = lanes_sum(here)
         if (attempt == 0 and here <= 0.0) or wp.abs(here) < -0.1 * slope:
             break
         # false position; the end that stays counts half
@@ -137,104 +176,74 @@ def _share_of_step(
 
 
 @wp.func
-def _press(m: Material, contacts: wp.array(dtype=Contact), count: wp.int32, Y: wp.array(dtype=wp.vec4)):
-    """Set the normal forces, by which friction is bounded, to those at motions Y; returns the largest change [N].
+def _press(m: Material, count: wp.int32, w: Scratch):
+    """Set the normal forces, by which friction is bounded, to those at motions ``Y``; returns the largest change [N].
 
     The points of a patch share its force evenly.
     """
+    for c in range(w.lane, count, w.lanes):
+        y = w.Y[c]
+        yn = wp.dot(w.contacts[c].normal, wp.vec3(y[0], y[1], y[2]))
+        w.press[c] = m.contact * wp.max(-(w.contacts[c].gap + yn), 0.0)
+    meet()
     change = float(0.0)
-    first = int(0)
-    while first < count:
-        end = first
+    for c in range(w.lane, count, w.lanes):
+        body = w.contacts[c].body
+        first = c
+        while first > 0 and w.contacts[first - 1].body == body:
+            first -= 1
         total = float(0.0)
-        while end < count and contacts[end].body == contacts[first].body:
-            yn = wp.dot(contacts[end].normal, wp.vec3(Y[end][0], Y[end][1], Y[end][2]))
-            total += m.contact * wp.max(-(contacts[end].gap + yn), 0.0)
+        end = first
+        while end < count and w.contacts[end].body == body:
+            total += w.press[end]
             end += 1
         force = total / float(end - first)
-        for c in range(first, end):
-            change = wp.max(change, wp.abs(force - contacts[c].force))
-            contacts[c].force = force
-        first = end
-    return change
+        change = wp.max(change, wp.abs(force - w.contacts[c].force))
+        w.contacts[c].force = force
+    meet()
+    return lanes_max(change)
 
 
 @wp.func
-def _stretch(m: Material, contacts: wp.array(dtype=Contact), count: wp.int32, Y: wp.array(dtype=wp.vec4)):
-    """Take over how far friction is stretched after motions Y; beyond its bound it slips."""
-    for c in range(count):
-        n = contacts[c].normal
-        y = wp.vec3(Y[c][0], Y[c][1], Y[c][2])
-        slip = contacts[c].slip + y - n * wp.dot(n, y)
-        most = m.friction * contacts[c].force / m.contact
+def _stretch(m: Material, count: wp.int32, w: Scratch):
+    """Take over how far friction is stretched after motions ``Y``; beyond its bound it slips."""
+    for c in range(w.lane, count, w.lanes):
+        n = w.contacts[c].normal
+        y = wp.vec3(w.Y[c][0], w.Y[c][1], w.Y[c][2])
+        slip = w.contacts[c].slip + y - n * wp.dot(n, y)
+        most = m.friction * w.contacts[c].force / m.contact
         far = wp.length(slip)
         if far > most:
             slip = slip * (most / far)
-        contacts[c].slip = slip
-        twist = m.torsion * contacts[c].force / twist_stiffness(m)
-        contacts[c].twist = wp.clamp(contacts[c].twist + Y[c][3], -twist, twist)
+        w.contacts[c].slip = slip
+        twist = m.torsion * w.contacts[c].force / twist_stiffness(m)
+        w.contacts[c].twist = wp.clamp(w.contacts[c].twist + w.Y[c][3], -twist, twist)
 
 
 @wp.func
-def solve_step(
-    hand: Hand,
-    m: Material,
-    body: Body,
-    contacts: wp.array(dtype=Contact),
-    count: wp.int32,
-    column: wp.array(dtype=wp.vec3),
-    spin: wp.array(dtype=wp.float32),
-    scale: wp.array(dtype=wp.float32),
-    q: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    dq: wp.array(dtype=wp.float32),
-):
-    """Motion of the object [m, rad]; writes that of the joints to ``dq``, and forces and slips of the contacts.
-
-    Args:
-        scale: of stiffness by dof, 1 for revolute joints.
-        q, target: [rad or m].
-    """
+def solve_step(hand: Hand, m: Material, body: Body, count: wp.int32, w: Scratch):
+    """Motion of the object [m, rad]; writes that of the joints to ``dq``, and forces and slips of the contacts."""
     dx = wp.spatial_vector()
-    A = wp.zeros(shape=(_BLOCKS,), dtype=wp.float32)
-    B = wp.zeros(shape=(_COUPLING,), dtype=wp.float32)
-    step = wp.zeros(shape=(_ROWS,), dtype=wp.float32)
-    Y = wp.zeros(shape=(MAX_TOUCHES,), dtype=wp.vec4)
-    Z = wp.zeros(shape=(MAX_TOUCHES,), dtype=wp.vec4)
     dofs = hand.kin.dof_first[hand.kin.groups]
-    shared = hand.kin.shared
-    for k in range(dofs):
-        dq[k] = 0.0
+    for k in range(w.lane, dofs, w.lanes):
+        w.dq[k] = 0.0
+    for c in range(w.lane, count, w.lanes):
+        w.Y[c] = wp.vec4()
+    meet()
     for _it in range(_ITERATIONS):
-        C, g = _add_own(hand, m, body, scale, q, target, dq, dx, A, B)
-        for c in range(count):
-            C, g = add_contact(hand, m, contacts[c], c, Y[c], body.com, column, spin, A, B, C, g)
-        for k in range(dofs + shared):
-            step[k] = B[k * 7 + 6]
-        h = g
-        for group in range(hand.kin.groups):
-            first = hand.kin.dof_first[group]
-            members = hand.kin.dof_first[group + 1] - first
-            C, h = eliminate_finger(first, hand.kin.dof_free[group], members, A, B, C, h)
-            gather_shared(hand, group, A, B, step)
-        C, h = eliminate_finger(dofs, shared, shared, A, B, C, h)
-        move = solve_object(C, h)
-        slope = wp.dot(g, move) + solve_finger(dofs, shared, shared, A, B, move, step)
-        for group in range(hand.kin.groups):
-            first = hand.kin.dof_first[group]
-            members = hand.kin.dof_first[group + 1] - first
-            give_shared(hand, group, step)
-            slope += solve_finger(first, hand.kin.dof_free[group], members, A, B, move, step)
-        for c in range(count):
-            Z[c] = relative_motion(hand, contacts[c], c, column, spin, step, move, body.com)
-        share = _share_of_step(hand, m, body, contacts, count, Y, Z, scale, q, target, dq, step, dx, move, slope)
-        for k in range(dofs):
-            dq[k] += share * step[k]
+        _assemble(hand, m, body, count, dx, w)
+        move, slope = _solve(hand, w)
+        for c in range(w.lane, count, w.lanes):
+            w.Z[c] = relative_motion(hand, w.contacts[c], c, w.column, w.spin, w.step, move, body.com)
+        share = _share_of_step(hand, m, body, count, dx, move, slope, w)
+        for k in range(w.lane, dofs, w.lanes):
+            w.dq[k] = w.dq[k] + share * w.step[k]
         dx = dx + move * share
-        for c in range(count):
-            Y[c] = Y[c] + Z[c] * share
-        change = _press(m, contacts, count, Y)
+        for c in range(w.lane, count, w.lanes):
+            w.Y[c] = w.Y[c] + w.Z[c] * share
+        change = _press(m, count, w)
         if -slope < _STOP and change < _FORCE_STOP:
             break
-    _stretch(m, contacts, count, Y)
+    _stretch(m, count, w)
+    meet()
     return dx

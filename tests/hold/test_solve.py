@@ -14,18 +14,16 @@ from support.urdfs import fingers
 
 from lgrasp.hand.arrays import Hand, HandArrays, body_poses, upload_hand
 from lgrasp.hand.build import build_hand
-from lgrasp.hold.contacts import MAX_TOUCHES, Contact
 from lgrasp.hold.energy import Body, Material, make_columns
-from lgrasp.hold.solve import MAX_HAND_DOFS, solve_step
+from lgrasp.hold.scratch import Contact, Scratches, empty_scratches, scratch_of
+from lgrasp.hold.solve import solve_step
 from lgrasp.math.kinematics import group_forward, vec_dof
-from lgrasp.math.limits import MAX_BODIES, MAX_DOFS
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 LIMIT, PATCH = 20.0, 0.005  # of joint limits over drives; arm of friction against twisting [m]
 DRIVE, DRAG, STIFF = 5.0, 1.0, 2e4
-WIDTH = MAX_TOUCHES * MAX_DOFS
 
 
 @wp.kernel
@@ -36,28 +34,28 @@ def step_once(
     given: wp.array(dtype=Contact),
     q: wp.array(dtype=wp.float32),
     target: wp.array(dtype=wp.float32),
+    scratch: Scratches,
     # out
-    dq_out: wp.array(dtype=wp.float32),
     dx_out: wp.array(dtype=wp.spatial_vector),
-    after_out: wp.array(dtype=Contact),
 ):
-    """One step of one hand: its joints q (K,) [rad], contacts (C,) before and after."""
-    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    column = wp.zeros(shape=(WIDTH,), dtype=wp.vec3)
-    spin = wp.zeros(shape=(WIDTH,), dtype=wp.float32)
-    scale = wp.zeros(shape=(MAX_HAND_DOFS,), dtype=wp.float32)
+    """One step of one hand with joints q (K,) [rad] and contacts (C,); what joints and contacts do is left in the
+    scratch memory."""
+    w = scratch_of(scratch, 0, 0, 1)
     for g in range(hand.kin.groups):
         v = vec_dof()
         first = hand.kin.dof_first[g]
         for d in range(hand.kin.dof_first[g + 1] - first):
             v[d] = q[first + d]
-            scale[first + d] = wp.where(hand.kin.dof_shared[first + d] < 0, 1.0, 0.5)
-        group_forward(hand.kin, g, v, X, hand.kin.joint_first[g])
+            w.q[first + d] = q[first + d]
+            w.target[first + d] = target[first + d]
+            w.group[first + d] = g
+            w.scale[first + d] = wp.where(hand.kin.dof_shared[first + d] < 0, 1.0, 0.5)
+        group_forward(hand.kin, g, v, w.X, hand.kin.joint_first[g])
     count = given.shape[0]
     for c in range(count):
-        after_out[c] = given[c]
-    make_columns(hand, X, after_out, count, column, spin)
-    dx_out[0] = solve_step(hand, m, body, after_out, count, column, spin, scale, q, target, dq_out)
+        w.contacts[c] = given[c]
+    make_columns(hand, w, count)
+    dx_out[0] = solve_step(hand, m, body, count, w)
 
 
 @dataclass(frozen=True)
@@ -205,12 +203,11 @@ def solved(hand: HandArrays, p: Problem) -> tuple[np.ndarray, np.ndarray]:
         contacts.append(one)
     given = wp.array(contacts, dtype=Contact, device="cpu")
     q, target = (wp.array(x[order].astype("f4"), device="cpu") for x in (p.q, p.target))
-    dq, dx = wp.zeros(len(order), dtype=float, device="cpu"), wp.zeros(1, dtype=wp.spatial_vector, device="cpu")
-    after = wp.zeros(len(contacts), dtype=Contact, device="cpu")
-    wp.launch(step_once, 1, [hand.struct, m, body, given, q, target], [dq, dx, after], device="cpu")
+    dx, scratch = wp.zeros(1, dtype=wp.spatial_vector, device="cpu"), empty_scratches(1, "cpu")
+    wp.launch(step_once, 1, [hand.struct, m, body, given, q, target, scratch], [dx], device="cpu")
     z = np.concatenate([np.zeros(len(p.q)), dx.numpy()[0]])
-    z[order] = dq.numpy()
-    return z, after.numpy()["force"]
+    z[order] = scratch.dq.numpy()[0, : len(order)]
+    return z, scratch.contacts.numpy()["force"][0, : len(contacts)]
 
 
 @pytest.mark.parametrize("seed", range(6))

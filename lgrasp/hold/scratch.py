@@ -1,0 +1,155 @@
+"""Memory that the lanes of a trial share."""
+
+from typing import Any
+
+import warp as wp
+
+from lgrasp.math.limits import MAX_BODIES, MAX_DOFS, MAX_GROUPS
+from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import make_struct
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+MAX_TOUCHES = 40
+"""Most contacts of a hand and an object."""
+MAX_HAND_DOFS = MAX_GROUPS * MAX_DOFS
+"""Most dofs of all groups together."""
+MAX_TAGS = 4
+"""Most contacts of a link."""
+OBJECT_TERMS = 27
+"""Numbers of the object's part of a system: the lower triangle of 6 x 6 row by row, then the gradient."""
+_ROWS = MAX_HAND_DOFS + MAX_DOFS  # those of the shared joints come last
+
+
+@wp.struct
+class Contact:
+    """Where a link meets the object."""
+
+    body: wp.int32
+    tag: wp.int32  # point of the link by which it is known from step to step
+    point: wp.vec3  # base frame [m]
+    normal: wp.vec3  # of the object, base frame
+    gap: wp.float32  # [m]
+    force: wp.float32  # along the normal, mean of the patch [N]
+    slip: wp.vec3  # across the normal that friction holds against, as a spring does [m]
+    twist: wp.float32  # the same about the normal [rad]
+
+
+@wp.struct
+class Terms:
+    """Slope and curvature of a contact's energy by the motion of its link."""
+
+    on: wp.int32  # 0: none
+    f: wp.vec3  # [N]
+    H: wp.mat33  # [N/m]
+    arm: wp.vec3  # from the object's centre of mass [m]
+    turn: wp.float32  # about the normal [N m]
+    turn_k: wp.float32  # [N m/rad]
+
+
+@wp.struct
+class Scratch:
+    """Of one trial."""
+
+    lane: wp.int32
+    lanes: wp.int32
+    contacts: wp.array(dtype=Contact)  # (MAX_TOUCHES,)
+    before: wp.array(dtype=Contact)  # (MAX_TOUCHES,) those of the step before
+    made: wp.array(dtype=Contact)  # (MAX_TAGS,) of one link
+    Y: wp.array(dtype=wp.vec4)  # (MAX_TOUCHES,) motion of each contact's link in this step [m], [rad]
+    Z: wp.array(dtype=wp.vec4)  # (MAX_TOUCHES,) that of an iteration
+    press: wp.array(dtype=wp.float32)  # (MAX_TOUCHES,) forces [N]
+    terms: wp.array(dtype=Terms)  # (MAX_TOUCHES,)
+    on_object: wp.array(dtype=wp.float32)  # (MAX_TOUCHES * OBJECT_TERMS,) what contacts add to the object's part
+    column: wp.array(dtype=wp.vec3)  # (MAX_TOUCHES * MAX_DOFS,) see make_columns
+    spin: wp.array(dtype=wp.float32)  # (MAX_TOUCHES * MAX_DOFS,)
+    X: wp.array(dtype=wp.transform)  # (MAX_BODIES,) T_base_body of bodies 1, 2, ...
+    q: wp.array(dtype=wp.float32)  # (MAX_HAND_DOFS,) [rad or m]
+    dq: wp.array(dtype=wp.float32)  # (MAX_HAND_DOFS,) motion in this step
+    target: wp.array(dtype=wp.float32)  # (MAX_HAND_DOFS,)
+    scale: wp.array(dtype=wp.float32)  # (MAX_HAND_DOFS,) of stiffness, 1 for revolute joints
+    group: wp.array(dtype=wp.int32)  # (MAX_HAND_DOFS,) of each dof
+    step: wp.array(dtype=wp.float32)  # (rows,) gradient, then step of an iteration
+    A: wp.array(dtype=wp.float32)  # (rows * MAX_DOFS,) see lgrasp.hold.system
+    B: wp.array(dtype=wp.float32)  # (rows * 7,)
+    C: wp.array(dtype=wp.float32)  # (OBJECT_TERMS,)
+    g: wp.array(dtype=wp.float32)  # (6,) the gradient, as it was
+
+
+@wp.struct
+class Scratches:
+    """Of W trials: the arrays of :class:`Scratch`, (W, ...) each."""
+
+    contacts: wp.array2d(dtype=Contact)
+    before: wp.array2d(dtype=Contact)
+    made: wp.array2d(dtype=Contact)
+    Y: wp.array2d(dtype=wp.vec4)
+    Z: wp.array2d(dtype=wp.vec4)
+    press: wp.array2d(dtype=wp.float32)
+    terms: wp.array2d(dtype=Terms)
+    on_object: wp.array2d(dtype=wp.float32)
+    column: wp.array2d(dtype=wp.vec3)
+    spin: wp.array2d(dtype=wp.float32)
+    X: wp.array2d(dtype=wp.transform)
+    q: wp.array2d(dtype=wp.float32)
+    dq: wp.array2d(dtype=wp.float32)
+    target: wp.array2d(dtype=wp.float32)
+    scale: wp.array2d(dtype=wp.float32)
+    group: wp.array2d(dtype=wp.int32)
+    step: wp.array2d(dtype=wp.float32)
+    A: wp.array2d(dtype=wp.float32)
+    B: wp.array2d(dtype=wp.float32)
+    C: wp.array2d(dtype=wp.float32)
+    g: wp.array2d(dtype=wp.float32)
+
+
+_SIZES = {
+    **dict.fromkeys(("contacts", "before", "Y", "Z", "press", "terms"), MAX_TOUCHES),
+    **dict.fromkeys(("column", "spin"), MAX_TOUCHES * MAX_DOFS),
+    **dict.fromkeys(("q", "dq", "target", "scale", "group"), MAX_HAND_DOFS),
+    "made": MAX_TAGS,
+    "on_object": MAX_TOUCHES * OBJECT_TERMS,
+    "X": MAX_BODIES,
+    "step": _ROWS,
+    "A": _ROWS * MAX_DOFS,
+    "B": _ROWS * 7,
+    "C": OBJECT_TERMS,
+    "g": 6,
+}
+
+
+def empty_scratches(workers: int, device: str) -> Any:
+    """Memory for as many trials at a time."""
+    kinds = {name: var.type.dtype for name, var in Scratches.vars.items()}
+    made = {name: wp.empty((workers, _SIZES[name]), dtype=kind, device=device) for name, kind in kinds.items()}
+    return make_struct(Scratches, **made)
+
+
+@wp.func
+def scratch_of(every: Scratches, i: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """Memory i, as a lane sees it."""
+    w = Scratch()
+    w.lane = lane
+    w.lanes = lanes
+    w.contacts = every.contacts[i]
+    w.before = every.before[i]
+    w.made = every.made[i]
+    w.Y = every.Y[i]
+    w.Z = every.Z[i]
+    w.press = every.press[i]
+    w.terms = every.terms[i]
+    w.on_object = every.on_object[i]
+    w.column = every.column[i]
+    w.spin = every.spin[i]
+    w.X = every.X[i]
+    w.q = every.q[i]
+    w.dq = every.dq[i]
+    w.target = every.target[i]
+    w.scale = every.scale[i]
+    w.group = every.group[i]
+    w.step = every.step[i]
+    w.A = every.A[i]
+    w.B = every.B[i]
+    w.C = every.C[i]
+    w.g = every.g[i]
+    return w

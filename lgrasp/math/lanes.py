@@ -1,0 +1,49 @@
+"""Lanes: threads that work on one thing together, one warp of a GPU, or the one thread of a CPU.
+
+Each lane of ``lanes`` takes the items ``lane``, ``lane + lanes``, ... of a loop. All run through the same branches and
+loops about the functions here; a block has whole warps only.
+"""
+
+import warp as wp
+
+LANES = 32
+"""On a GPU."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+__syncwarp();
+#endif
+""")
+def meet():
+    """Wait until every lane is here; each then sees what the others wrote."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+for (int k = 16; k > 0; k >>= 1) x += __shfl_xor_sync(0xffffffffu, x, k);
+#endif
+return x;
+""")
+def lanes_sum(x: wp.float32) -> wp.float32:
+    """Sum over the lanes, the same in all."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+for (int k = 16; k > 0; k >>= 1) x = max(x, __shfl_xor_sync(0xffffffffu, x, k));
+#endif
+return x;
+""")
+def lanes_max(x: wp.float32) -> wp.float32:
+    """Greatest of the lanes' numbers, in all."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+for (int k = 16; k > 0; k >>= 1) x = min(x, __shfl_xor_sync(0xffffffffu, x, k));
+#endif
+return x;
+""")
+def lanes_least(x: wp.int32) -> wp.int32:
+    """Least of the lanes' numbers, in all."""
