@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.math.convex import Pieces, point_depth
-from lgrasp.math.sdf import sdf_value
+from lgrasp.math.sdf import deeper, sdf_below, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -31,7 +31,7 @@ def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: 
         return True
     for k in range(hand.sphere_first[body], hand.sphere_first[body + 1]):
         s = hand.spheres[k]
-        if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] - slack:
+        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3] - slack):
             return False
     return True
 
@@ -43,9 +43,9 @@ def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin:
         return True
     for k in range(hand.cluster_first[body], hand.cluster_first[body + 1]):
         s = hand.cluster_sphere[k]
-        if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] + margin:
+        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3] + margin):
             for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                if sdf_value(obj.sdf, wp.transform_point(T, hand.samples[i])) < margin:
+                if sdf_below(obj.sdf, wp.transform_point(T, hand.samples[i]), margin):
                     return False
     return True
 
@@ -80,9 +80,9 @@ def body_depth_slice(
         return depth
     for k in range(hand.cluster_first[body] + first_run, hand.cluster_first[body + 1], slices):
         s = hand.cluster_sphere[k]
-        if sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3]:
+        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3]):
             for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                depth = wp.max(depth, -sdf_value(obj.sdf, wp.transform_point(T, hand.samples[i])))
+                depth = deeper(obj.sdf, wp.transform_point(T, hand.samples[i]), depth)
             if depth > limit:
                 return depth
     T_body = wp.transform_inverse(T)
@@ -102,9 +102,9 @@ def body_depth_slice(
                 if grid >= 0:
                     # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
                     sdf = hand_grid(hand.contacts, grid)
-                    if sdf_value(sdf, p) < s[3]:
+                    if sdf_below(sdf, p, s[3]):
                         for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                            depth = wp.max(depth, -sdf_value(sdf, wp.transform_point(T_body, obj.obstacles[i])))
+                            depth = deeper(sdf, wp.transform_point(T_body, obj.obstacles[i]), depth)
                 elif point_depth(hand.pieces, piece, p) < s[3]:
                     for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                         q = wp.transform_point(T_body, obj.obstacles[i])
@@ -175,9 +175,9 @@ def _points_apart(a: Object, b: Object, T: wp.transform, margin: wp.float32):
     """True if all obstacle points of a are farther than ``margin`` [m] from b. T = T_b_a."""
     for k in range(a.clusters):
         s = a.cluster_sphere[k]
-        if sdf_value(b.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2]))) < s[3] + margin:
+        if sdf_below(b.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3] + margin):
             for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                if sdf_value(b.sdf, wp.transform_point(T, a.obstacles[i])) < margin:
+                if sdf_below(b.sdf, wp.transform_point(T, a.obstacles[i]), margin):
                     return False
     return True
 

@@ -1,10 +1,16 @@
 """Signed distance grids: one lookup with trilinear interpolation, value or value and gradient."""
 
+import numpy as np
 import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
+
+BLOCK = wp.constant(4)
+"""Cells on a side of the blocks whose least value is known."""
+
+_NODE_REACH = wp.constant(2.0)  # cells: within half a cell along each axis of a node distances are less by this at most
 
 
 @wp.struct
@@ -18,6 +24,20 @@ class Sdf:
     nz: wp.int32
     origin: wp.vec3
     inv_cell: wp.float32
+    least: wp.array(dtype=wp.float32)  # (blocks,) least value in each block of BLOCK cells a side [m], or (0,)
+
+
+def block_minima(values: np.ndarray) -> np.ndarray:
+    """Least value in each block of BLOCK cells a side, flat.
+
+    Args:
+        values: at the nodes of a grid, (nx, ny, nz).
+    """
+    for axis, nodes in enumerate(values.shape):
+        first = np.arange(0, nodes - 1, BLOCK)
+        at = np.minimum(first[:, None] + np.arange(BLOCK + 1), nodes - 1)
+        values = np.take(values, at, axis).min(axis + 1)
+    return values.ravel()
 
 
 @wp.func
@@ -88,6 +108,34 @@ def sdf_value(s: Sdf, p: wp.vec3):
         o2 = o2 / (s.inv_cell * s.inv_cell)
         d = wp.sqrt(o2 + wp.max(d, 0.0) * wp.max(d, 0.0))
     return d
+
+
+@wp.func
+def _far(s: Sdf, p: wp.vec3, limit: wp.float32):
+    """True only if :func:`sdf_value` is ``limit`` [m] at least; found by a block of cells or a node, where they tell."""
+    c = _clamped(s, (p - s.origin) * s.inv_cell)
+    if s.least.shape[0] > 0:
+        ny = (s.ny + BLOCK - 2) // BLOCK
+        nz = (s.nz + BLOCK - 2) // BLOCK
+        return s.least[((int(c[0]) // BLOCK) * ny + int(c[1]) // BLOCK) * nz + int(c[2]) // BLOCK] >= limit
+    node = (int(c[0] + 0.5) * s.ny + int(c[1] + 0.5)) * s.nz + int(c[2] + 0.5)
+    return s.values[s.first + node] >= limit + _NODE_REACH / s.inv_cell
+
+
+@wp.func
+def sdf_below(s: Sdf, p: wp.vec3, limit: wp.float32):
+    """True if :func:`sdf_value` is less than ``limit`` [m]."""
+    if _far(s, p, limit):
+        return False
+    return sdf_value(s, p) < limit
+
+
+@wp.func
+def deeper(s: Sdf, p: wp.vec3, depth: wp.float32):
+    """The larger of ``depth`` and the depth of p [m]."""
+    if _far(s, p, -depth):
+        return depth
+    return wp.max(depth, -sdf_value(s, p))
 
 
 @wp.func

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.math.sdf import Sdf
+from lgrasp.math.sdf import Sdf, block_minima
 from lgrasp.object.model import ObjectModel, SteeredObject
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
@@ -68,7 +68,7 @@ def upload_object(model: ObjectModel | SteeredObject, device: str, planes: np.nd
         if steered.weights.share < 1.0:
             touch = wp.array(steered.touch.astype(np.int32), dtype=wp.int32, device=device)
     nx, ny, nz = map(int, model.sdf.shape)
-    grid = {"values": model.sdf.ravel(), "origin": model.sdf_origin, "inv_cell": 1.0 / float(model.sdf_cell)}
+    grid = {"values": model.sdf.ravel(), "least": block_minima(model.sdf), "origin": model.sdf_origin, "inv_cell": 1.0 / float(model.sdf_cell)}
     same = {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")}
     others = {
         "sdf": upload_struct(Sdf, device, {**grid, "first": 0, "nx": nx, "ny": ny, "nz": nz}),
