@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.hand.arrays import Hand, hand_grid
 from lgrasp.math.convex import Pieces, point_depth
-from lgrasp.math.sdf import deeper, sdf_below, sdf_value
+from lgrasp.math.sdf import deeper, sdf_below, sdf_far, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -21,7 +21,7 @@ def body_far(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: w
     b = hand.pieces.body_sphere[body]
     if b[3] < 0.0:
         return True
-    return sdf_value(obj.sdf, wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))) > b[3] + margin
+    return sdf_far(obj.sdf, wp.transform_point(T, wp.vec3(b[0], b[1], b[2])), b[3] + margin)
 
 
 @wp.func
@@ -76,7 +76,7 @@ def body_depth_slice(
     if b[3] < 0.0:
         return depth
     centre = wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))
-    if sdf_value(obj.sdf, centre) > b[3]:
+    if not sdf_below(obj.sdf, centre, b[3]):
         return depth
     for k in range(hand.cluster_first[body] + first_run, hand.cluster_first[body + 1], slices):
         s = hand.cluster_sphere[k]

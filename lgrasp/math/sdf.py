@@ -111,7 +111,7 @@ def sdf_value(s: Sdf, p: wp.vec3):
 
 
 @wp.func
-def _far(s: Sdf, p: wp.vec3, limit: wp.float32):
+def sdf_far(s: Sdf, p: wp.vec3, limit: wp.float32):
     """True only if :func:`sdf_value` is ``limit`` [m] at least; found by a block of cells or a node, where they tell."""
     c = _clamped(s, (p - s.origin) * s.inv_cell)
     if s.least.shape[0] > 0:
@@ -125,7 +125,7 @@ def _far(s: Sdf, p: wp.vec3, limit: wp.float32):
 @wp.func
 def sdf_below(s: Sdf, p: wp.vec3, limit: wp.float32):
     """True if :func:`sdf_value` is less than ``limit`` [m]."""
-    if _far(s, p, limit):
+    if sdf_far(s, p, limit):
         return False
     return sdf_value(s, p) < limit
 
@@ -133,7 +133,7 @@ def sdf_below(s: Sdf, p: wp.vec3, limit: wp.float32):
 @wp.func
 def deeper(s: Sdf, p: wp.vec3, depth: wp.float32):
     """The larger of ``depth`` and the depth of p [m]."""
-    if _far(s, p, -depth):
+    if sdf_far(s, p, -depth):
         return depth
     return wp.max(depth, -sdf_value(s, p))
 
