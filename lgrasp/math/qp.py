@@ -26,6 +26,10 @@ mat86 = wp.types.matrix((_MAX_CORRAL, 6), wp.float32)
 mat83 = wp.types.matrix((_MAX_CORRAL, 3), wp.float32)
 mat63 = wp.types.matrix((MAX_CONTACTS, 3), wp.float32)
 mat_gram = wp.types.matrix((MAX_CONTACTS, MAX_CONTACTS), wp.float32)
+_FEW = 4  # contacts whose systems stay in registers
+mat_few = wp.types.matrix((_FEW, _FEW), wp.float32)
+mat_few3 = wp.types.matrix((_FEW, 3), wp.float32)
+vec_few = wp.types.vector(_FEW, wp.float32)
 vec_share = wp.types.vector(MAX_CONTACTS, wp.float32)
 
 
@@ -325,6 +329,72 @@ def by_difficulty(normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, ra
 
 
 @wp.func
+def _frictionless_few(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.float32):
+    """:func:`frictionless` of at most _FEW contacts: the same with loops of known length."""
+    centroid = wp.vec3(0.0)
+    for i in range(k):
+        centroid = centroid + points[i]
+    centroid = centroid / float(k)
+    N = mat_few3()
+    W = mat_few3()
+    G = mat_few()
+    active = vec_few()
+    trace = float(0.0)
+    for i in range(wp.static(_FEW)):
+        if wp.static(i) < k:
+            active[i] = 1.0
+            N[i] = normals[i]
+            W[i] = wp.cross(points[i] - centroid, normals[i]) * torque_scale
+        for j in range(wp.static(i + 1)):
+            G[i, wp.static(j)] = wp.dot(N[i], N[j]) + wp.dot(W[i], W[j])
+        trace += G[i, i]
+    eps = 1.0e-6 * trace / float(k)
+    least = float(0.0)
+    value = float(0.0)
+    for _drop in range(k):
+        # L D L^T of the active block; inactive rows are identity
+        L = mat_few()
+        M = mat_few()  # L D
+        inverse = vec_few()  # of D
+        z = vec_few()
+        for i in range(wp.static(_FEW)):
+            d = active[i] * G[i, i] + wp.where(active[i] > 0.0, eps, 1.0)
+            y = active[wp.static(i)]
+            for j in range(i):
+                s = active[i] * active[j] * G[i, j]
+                for c in range(j):
+                    s -= M[i, wp.static(c)] * L[j, c]
+                M[i, wp.static(j)] = s
+                L[i, j] = s * inverse[j]
+                d -= s * L[i, j]
+                y -= L[i, j] * z[j]
+            inverse[i] = 1.0 / wp.max(d, eps * 0.01)
+            z[i] = y
+        total = float(0.0)
+        low = float(1.0e30)
+        drop = int(0)
+        for b in range(wp.static(_FEW)):
+            i = wp.static(_FEW - 1 - b)
+            s = z[i] * inverse[i]
+            for c in range(wp.static(_FEW - b), wp.static(_FEW)):
+                s -= L[wp.static(c), i] * z[c]
+            z[i] = s
+            if active[i] > 0.0:
+                total += s
+                if s < low:
+                    low = s
+                    drop = i
+        value = 1.0 / wp.max(total, 1.0e-12)
+        if low >= 0.0:
+            if _drop == 0:
+                least = low * value
+            break
+        for i in range(wp.static(_FEW)):
+            active[i] = wp.where(wp.static(i) == drop, 0.0, active[i])
+    return wp.vec2(wp.sqrt(wp.max(value - eps, 0.0)), least)
+
+
+@wp.func
 def frictionless(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.float32):
     """FSWO (eq. 1) by active sets on the k x k Gram matrix, for the inner loop of the search.
 
@@ -335,6 +405,8 @@ def frictionless(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.fl
     Returns:
         (least norm, smallest share of the normal force; 0 when a contact was dropped).
     """
+    if k <= _FEW:
+        return _frictionless_few(points, normals, k, torque_scale)
     centroid = wp.vec3(0.0)
     for i in range(k):
         centroid = centroid + points[i]
