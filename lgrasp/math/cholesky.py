@@ -20,28 +20,27 @@ def solving(size: int) -> Any:
     def solve(A: square, b: column, n: wp.int32, shift: wp.float32, floor: wp.float32):
         L = square()
         x = column()
-        for i in range(n):
-            for j in range(i + 1):
-                s = A[i, j]
-                if i == j:
-                    s += shift
-                for c in range(j):
-                    s -= L[i, c] * L[j, c]
-                if i == j:
-                    L[i, i] = wp.sqrt(wp.max(s, floor))
-                else:
+        for i in range(wp.static(size)):
+            if wp.static(i) < n:
+                y = b[i]
+                for j in range(i):
+                    s = A[i, wp.static(j)]
+                    for c in range(j):
+                        s -= L[i, wp.static(c)] * L[j, c]
                     L[i, j] = s / L[j, j]
-        for i in range(n):
-            s = b[i]
-            for c in range(i):
-                s -= L[i, c] * x[c]
-            x[i] = s / L[i, i]
-        for r in range(n):
-            i = n - 1 - r
-            s = x[i]
-            for c in range(i + 1, n):
-                s -= L[c, i] * x[c]
-            x[i] = s / L[i, i]
+                d = A[i, i] + shift
+                for c in range(i):
+                    d -= L[i, wp.static(c)] * L[i, c]
+                    y -= L[i, c] * x[c]
+                L[i, i] = wp.sqrt(wp.max(d, floor))
+                x[i] = y / L[i, i]
+        for r in range(wp.static(size)):
+            i = wp.static(size - 1 - r)
+            if i < n:
+                s = x[i]
+                for c in range(wp.static(size - r), wp.static(size)):
+                    s -= L[wp.static(c), i] * x[c]
+                x[i] = s / L[i, i]
         return x
 
     return solve
