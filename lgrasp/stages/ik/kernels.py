@@ -132,17 +132,17 @@ def _realising(size: int) -> Any:
                 J1[d] = J1[d] + point_column(hand.kin, j0 + j, X[j], p)
                 J2[d] = J2[d] + point_column(hand.kin, j0 + j, X[j], p + n * params.lever)
                 j = hand.kin.joint_parent[j0 + j]
-            for a in range(size):
+            for a in range(wp.static(size)):
                 if a >= dofs or ((still >> a) & 1) == 1:
                     J1[a] = wp.vec3(0.0)
                     J2[a] = wp.vec3(0.0)
                 b[a] = wp.dot(J1[a], e1) + w2 * wp.dot(J2[a], e2)
-                for k in range(a + 1):
-                    A[a, k] = wp.dot(J1[a], J1[k]) + w2 * wp.dot(J2[a], J2[k])
+                for k in range(wp.static(a + 1)):
+                    A[a, wp.static(k)] = wp.dot(J1[a], J1[k]) + w2 * wp.dot(J2[a], J2[k])
                 A[a, a] = A[a, a] + params.damping
             step = solve(A, b, size, 0.0, 1.0e-12)
-            for a in range(dofs):
-                q[a] = q[a] + wp.clamp(step[a], -params.step, params.step)
+            for a in range(wp.static(size)):
+                q[wp.static(a)] = q[a] + wp.clamp(step[a], -params.step, params.step)
             q = clamp_dofs(hand.kin, g, q)
         state = int(State.REALISED)
         if wp.abs(gap + params.contact_indentation) > params.gap or dot < params.cosine:
