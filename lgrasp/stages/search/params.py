@@ -62,6 +62,11 @@ class SearchParams(Params):
         "are left out of later starts.",
     )
     per_pose: int = Field(default=3, ge=1, le=MAX_RESTARTS, description="Most sets per pose.")
+    taper: bool = Field(
+        default=False,
+        description="Later starts are for poses with few sets: with each further share of the starts a pose may have "
+        "one set less.",
+    )
     passes: int = Field(default=1, ge=1, le=64, description="Rounds over the same candidates (multi-pass generation).")
     separation: float = Field(
         default=0.12, ge=0, le=3, description="Sets of one pose with the same fingers differ by this [rad]."

@@ -74,6 +74,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     for first in range(0, params.restarts, lanes):
         if first + lanes > params.restarts:
             tried.score = tried.score[:, : params.restarts - first]
+        values.per_pose = params.per_pose - (params.taper * params.per_pose * first) // params.restarts
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
         wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
         if swap:
