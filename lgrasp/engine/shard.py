@@ -206,7 +206,11 @@ def make_shard(
     def run(part: tuple[int, int]) -> BatchResult:
         before = waited()
         with turn:
-            found = run_batch(pipeline, context, *part, graphs.run if graphs else None)
+            try:
+                found = run_batch(pipeline, context, *part, graphs.run if graphs else None)
+            finally:
+                if graphs:
+                    graphs.done()
         result.waited += waited() - before
         return found
 

@@ -14,7 +14,7 @@ import warp as wp
 
 from lgrasp.grasp.records import padded
 from lgrasp.grasp.structs import Candidates, Poses, Sets
-from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.fetch import fetch, to_numpy
 from lgrasp.runtime.structs import empty_arrays, make_struct
 
 _FAMILIES = ("metrics", "physics", "table")  # columns of a table in memory that come by name
@@ -160,7 +160,10 @@ class GraspTable:
 
 
 def trim_sets(table: ContactSets, used: int | None = None) -> ContactSets:
-    """Views of the rows in use; waits for the device where ``used``, their number, is not given."""
+    """Views of the rows in use; waits for the device where ``used``, their number, is not given, and others may launch
+    meanwhile."""
+    if used is None and table.used is None:
+        used = int(fetch([table.rows], others=True)[0][0])
     n = len(table) if used is None else used
     if n == table.pose.shape[0]:
         return table

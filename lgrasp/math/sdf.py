@@ -112,7 +112,7 @@ def sdf_value(s: Sdf, p: wp.vec3):
 
 @wp.func
 def sdf_far(s: Sdf, p: wp.vec3, limit: wp.float32):
-    """True only if :func:`sdf_value` is ``limit`` [m] at least; found by a block of cells or a node, where they tell."""
+    """True only if :func:`sdf_value` is ``limit`` [m] at least: by what a block of cells, or a node, tells at once."""
     c = _clamped(s, (p - s.origin) * s.inv_cell)
     if s.least.shape[0] > 0:
         ny = (s.ny + BLOCK - 2) // BLOCK

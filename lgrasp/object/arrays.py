@@ -68,7 +68,8 @@ def upload_object(model: ObjectModel | SteeredObject, device: str, planes: np.nd
         if steered.weights.share < 1.0:
             touch = wp.array(steered.touch.astype(np.int32), dtype=wp.int32, device=device)
     nx, ny, nz = map(int, model.sdf.shape)
-    grid = {"values": model.sdf.ravel(), "least": block_minima(model.sdf), "origin": model.sdf_origin, "inv_cell": 1.0 / float(model.sdf_cell)}
+    grid = {"values": model.sdf.ravel(), "least": block_minima(model.sdf)}
+    grid |= {"origin": model.sdf_origin, "inv_cell": 1.0 / float(model.sdf_cell)}
     same = {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")}
     others = {
         "sdf": upload_struct(Sdf, device, {**grid, "first": 0, "nx": nx, "ny": ny, "nz": nz}),

@@ -80,10 +80,10 @@ class Meter:
     def again(self, arrays: Sequence[wp.array]) -> tuple["Meter", list[np.ndarray]]:
         """The same stages once more, recorded and replayed; and copies of other arrays.
 
-        All is read at once: the next replay, of whichever thread, overwrites it.
+        All is read at once: the next replay overwrites it. Others may launch meanwhile.
         """
         own = [Tally(c.names, c.device) if isinstance(c, Tally) else c for _, c, _, _ in self._parts]
-        read = read_tallies([counts for counts in own if isinstance(counts, Tally)], arrays)
+        read = read_tallies([counts for counts in own if isinstance(counts, Tally)], arrays, others=True)
         meter = Meter(self._device.alias)
         for (stage, _, start, end), counts in zip(self._parts, own, strict=True):
             meter.add(stage, counts, 0.0, _seconds(start, end))
