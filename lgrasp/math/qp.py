@@ -45,17 +45,16 @@ def _best_direction(a: wp.vec3, n: wp.vec3, mu: wp.float32, edges: wp.int32):
     """Force with unit normal part inside the friction cone that minimises a . f; edges = 0: the round cone."""
     if mu <= 0.0:
         return n
-    t = tangent(n)
-    b = wp.cross(n, t)
-    u = wp.dot(a, t)
-    v = wp.dot(a, b)
     if edges == 0:
-        s = wp.sqrt(u * u + v * v)
+        across = a - n * wp.dot(a, n)
+        s = wp.length(across)
         if s < 1.0e-12:
             return n
-        return n - (t * u + b * v) * (mu / s)
+        return n - across * (mu / s)
+    t = tangent(n)
+    b = wp.cross(n, t)
     step = 6.2831853 / float(edges)
-    angle = wp.round(wp.atan2(-v, -u) / step) * step
+    angle = wp.round(wp.atan2(-wp.dot(a, b), -wp.dot(a, t)) / step) * step
     return n + (t * wp.cos(angle) + b * wp.sin(angle)) * mu
 
 
@@ -311,12 +310,13 @@ def by_difficulty(normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, ra
     What they lack is a bound from forces alone, so that loads which nothing resists come first.
     """
     lack = vec6()
-    for direction in range(6):
-        e = _pull(turn, direction)
-        least = float(0.0)
+    for axis in range(3):
+        e = _pull(turn, axis)
         for i in range(k):
-            least = wp.min(least, wp.dot(e, _best_direction(e, normals[i], mu, 0)))
-        lack[direction] = least
+            along = wp.dot(e, normals[i])
+            across = mu * wp.sqrt(wp.max(1.0 - along * along, 0.0))
+            lack[axis] = wp.min(lack[axis], along - across)
+            lack[axis + 3] = wp.min(lack[axis + 3], -along - across)
     found = int(0)
     for a in range(6):
         before = int(0)
