@@ -29,7 +29,8 @@ from lgrasp.stages.context import Context
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
 _LEAST_PLACED = 65_536  # candidates of which one must be placed where poses are steered, else a shard ends
 _EFFORT_STEP = 1024  # candidates: what a shard may try is a multiple of it
-_CPU_BATCH, _CPU_LARGEST = 256, 512  # candidates of a batch; the second with several passes
+_CPU_LARGEST = 1024  # candidates of a batch
+_SLOW_LARGEST = 512  # the same where a candidate takes long (block_size)
 _PHYSICS_BATCH = 64  # candidates, when their grasps are simulated on the CPU, which takes long
 _GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
@@ -92,7 +93,7 @@ def _batch_size(
     running: int,
     most: int = _GPU_LARGEST,
     *,
-    passes: int = 1,
+    block: int = PASS_BLOCK,
     share: int = 1,
 ) -> int:
     """Candidates of a batch when ``running`` others are worked on; 0 when those should give the missing rows.
@@ -101,16 +102,15 @@ def _batch_size(
 
     Args:
         rate: rows expected per candidate.
+        block: candidates of a block (:func:`block_size`).
         share: workers among which a CPU divides what is missing; 0: the rate is a guess, which must leave none idle.
     """
     if running >= missing / rate > 0 and (share or device != "cpu"):
         return 0
-    if device == "cpu" and passes == 1:
-        return _CPU_BATCH
     if device == "cpu":
-        # a batch makes many rows: shares of what is missing keep the workers busy to the end and little in vain
+        # large ones are faster; shares of what is missing keep the workers busy to the end and little in vain
         needed = (missing / rate - running) / share if share else 0
-        return int(min(max(needed, PASS_BLOCK), _CPU_LARGEST))
+        return int(min(max(needed, block), _SLOW_LARGEST if block == PASS_BLOCK else _CPU_LARGEST))
     needed = 1.05 * missing / rate + 256 - running
     return int(min(max(needed, _GPU_SMALLEST), most))
 
@@ -191,14 +191,14 @@ def make_shard(
     if account:
         found.restore(account)
     start = time.time()
-    fixed, passes = _fixed_batch(context, execution), pipeline.params("search").passes
+    fixed = _fixed_batch(context, execution)
     most = _GPU_LARGEST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups, pipeline)
 
     def size(running: int) -> int:
         # going by those so far
         rate, missing = found.count / result.candidates if found.count else execution.rate, rows - found.count
         share = execution.workers if found.count else 0
-        wanted = fixed or _batch_size(device, missing, rate, running, most, passes=passes, share=share)
+        wanted = fixed or _batch_size(device, missing, rate, running, most, block=block, share=share)
         if graphs and not fixed and wanted:
             wanted = graphs.size(wanted)
         return -(-wanted // block) * block
