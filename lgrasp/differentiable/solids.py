@@ -50,8 +50,16 @@ class HandPoints:
 def hand_solids(model: HandModel, count: int) -> HandPoints:
     """The links of a hand as solids, with about ``count`` surface points together (more on small links).
 
-    A link is the union of its convex pieces, which stand for its collision geometry in all of lgrasp.
+    A link is the union of its convex pieces, which stand for its collision geometry in all of lgrasp. They are kept
+    with the model.
     """
+    made = vars(model).setdefault("_solids", {})  # as cached_property does
+    if count not in made:
+        made[count] = _hand_solids(model, count)
+    return made[count]
+
+
+def _hand_solids(model: HandModel, count: int) -> HandPoints:
     pieces = [model.piece(i) for i in range(len(model.piece_body))]
     members = {int(k): np.flatnonzero(model.piece_link == k) for k in np.unique(model.piece_link)}
     static = int(model.cluster_first[1]) * CLUSTER_SIZE

@@ -75,6 +75,9 @@ class Job(Request, ABC):
             LgraspError: an option is out of range, or an input is not found.
         """
 
+    def warm(self) -> None:
+        """Have libraries load what their first call would, once the inputs are loaded and while kernels are."""
+
     def about(self) -> dict[str, Any]:
         """What manifests say of the run, as far as it is the same for all parts: ``hand``, ``objects``, ``pipeline``,
         ``seed``; called when the inputs are loaded."""
@@ -257,7 +260,10 @@ def prepare(job: Job, todo: "Todo") -> float:
     job.load(job.events, bool(missing))
     begin = time.perf_counter()
     if missing and job.kernels:
-        load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading)
+        with ThreadPoolExecutor(1) as pool:
+            warmed = pool.submit(job.warm)
+            load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading)
+            warmed.result()
     return time.perf_counter() - begin
 
 

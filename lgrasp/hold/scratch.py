@@ -39,7 +39,7 @@ class Contact:
 class Terms:
     """Slope and curvature of a contact's energy by the motion of its link."""
 
-    on: wp.int32  # 0: none
+    group: wp.int32  # that the link is of; -1: none, or nothing pulls
     f: wp.vec3  # [N]
     H: wp.mat33  # [N/m]
     arm: wp.vec3  # from the object's centre of mass [m]

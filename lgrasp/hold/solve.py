@@ -42,7 +42,8 @@ _SEARCH = wp.constant(10)  # points tried along a step
 def _assemble(hand: Hand, m: Material, body: Body, count: wp.int32, dx: wp.spatial_vector, w: Scratch):
     """Write the system at the motion so far, and its gradient by the joints to ``step``."""
     for c in range(w.lane, count, w.lanes):
-        w.terms[c] = contact_terms(m, body.com, w.contacts[c], w.Y[c], c * OBJECT_TERMS, w.on_object)
+        group = hand.body_group[w.contacts[c].body]
+        w.terms[c] = contact_terms(m, body.com, w.contacts[c], group, w.Y[c], c * OBJECT_TERMS, w.on_object)
     meet()
     end = hand.kin.dof_first[hand.kin.groups]
     for k in range(w.lane, end, w.lanes):

@@ -25,20 +25,28 @@ _LEAST = wp.constant(1.0e-9)  # of a pivot
 
 @wp.func
 def contact_terms(
-    m: Material, com: wp.vec3, contact: Contact, y: wp.vec4, at: wp.int32, on_object: wp.array(dtype=wp.float32)
+    m: Material,
+    com: wp.vec3,
+    contact: Contact,
+    group: wp.int32,
+    y: wp.vec4,
+    at: wp.int32,
+    on_object: wp.array(dtype=wp.float32),
 ):
-    """Slope and curvature of a contact at its motion y; writes what it adds to the object's part, from ``at`` on."""
+    """Slope and curvature of a contact on a group at its motion y; what it adds to the object's part is written, from
+    ``at`` on."""
     n = contact.normal
     s = wp.vec3(y[0], y[1], y[2])
     yn = wp.dot(n, s)
     deep = wp.max(-(contact.gap + yn), 0.0)
     limit = m.friction * contact.force
     own = Terms()
+    own.group = -1
     RH = wp.mat33(0.0)
     K = wp.mat33(0.0)
     rf = wp.vec3(0.0)
     if deep > 0.0 or limit > 0.0:
-        own.on = 1
+        own.group = group
         own.f = n * (-m.contact * deep)
         H = wp.mat33(0.0)
         if deep > 0.0:
@@ -90,7 +98,7 @@ def set_row(
     top = wp.vec3(0.0)
     bottom = wp.vec3(0.0)
     for c in range(count):
-        if w.terms[c].on == 1 and hand.body_group[w.contacts[c].body] == group:
+        if w.terms[c].group == group:
             j = w.column[c * MAX_DOFS + d]
             t = w.spin[c * MAX_DOFS + d]
             turn_k = w.terms[c].turn_k

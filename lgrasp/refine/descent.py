@@ -8,8 +8,9 @@ from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.hand.palm import palm_axis
-from lgrasp.refine.descent_kernels import Moments, Schedule, advance, descend, penetration
-from lgrasp.refine.energy_gradient import MAX_COLUMNS, Search
+from lgrasp.math.lanes import LANES
+from lgrasp.refine.descent_kernels import Moments, Parts, Schedule, advance, descend, penetration
+from lgrasp.refine.energy_gradient import MAX_COLUMNS, Scratches, Search
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.match_kernels import (
     DEEPEST,
@@ -31,7 +32,7 @@ from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.structs import empty_struct, make_struct, upload_struct
 
 _MAX_ADVANCES = 30
-_BLOCK_ROWS = 32  # hands of a block of threads: few hands spread over many processors
+_WORKERS = 1 << 13  # hands moved at a time on a GPU: more than it has place for
 
 
 class Descent:
@@ -169,9 +170,9 @@ class Descent:
         self._place(at, body)
         self._match_object(m, body, reach)
         near = max(p.contacts, int(p.nearest * points.palmar.shape[0]))
-        wp.launch(
-            choose_contacts, dim=rows, inputs=[points, near, p.contacts, body, m], device=d, block_dim=_BLOCK_ROWS
-        )
+        lanes = 1 if d == "cpu" else LANES
+        inputs = [points, near, p.contacts, lanes, body, m]
+        wp.launch(choose_contacts, dim=(rows, lanes), inputs=inputs, device=d, block_dim=LANES)
         wp.launch(match_links, dim=(solids.pairs.shape[0], rows), inputs=[solids, p.margin, body, m], device=d)
 
     def _match_object(self, m: "Correspondences", body: wp.array, reach: float) -> None:
@@ -185,18 +186,23 @@ class Descent:
     def _descend(
         self, at: Hands, m: "Correspondences", taken: int, first: int, whole: int, gradient: bool, moments: "Moments"
     ) -> None:
-        inputs = [self._hand.struct.kin, self._points, self._solids, self._target.own, self._search, m]
+        parts = make_struct(Parts, points=self._points, solids=self._solids, own=self._target.own)
         skipped = first * self.params.gradient_steps
         schedule = make_struct(Schedule, taken=taken, skipped=skipped, whole=float(whole), gradient=int(gradient))
-        inputs += [schedule, moments]
-        wp.launch(
-            descend,
-            dim=at.pose.shape[0],
-            inputs=inputs,
-            outputs=[at.pose, at.q],
-            device=self.device,
-            block_dim=_BLOCK_ROWS,
-        )
+        scratch = self._scratch(at.pose.shape[0])
+        inputs = [self._hand.struct.kin, parts, self._search, m, schedule, scratch, moments]
+        dim = (scratch.X.shape[0], scratch.lanes)
+        wp.launch(descend, dim=dim, inputs=inputs, outputs=[at.pose, at.q], device=self.device, block_dim=LANES)
+
+    def _scratch(self, rows: int) -> "Scratches":
+        """For as many hands as are moved at a time."""
+        lanes, most = (1, 1) if self.device == "cpu" else (LANES, _WORKERS)
+        parts = self._points.body.shape[0] + self.params.contacts + self._solids.body.shape[0]
+        wide = dict.fromkeys(("X", "F", "M"), self._bodies) | {"by_joint": self._bodies, "moved": 6}
+        wide |= dict.fromkeys(("part_body", "part_force", "part_moment"), parts) | {"by_q": self._hand.model.dofs}
+        kinds = {name: Scratches.vars[name].type.dtype for name in wide}
+        made = {n: wp.empty((min(rows, most), wide[n]), dtype=kinds[n], device=self.device) for n in wide}
+        return make_struct(Scratches, lanes=lanes, **made)
 
 
 def _middle(hand: HandArrays, surface: HandSurface) -> np.ndarray:

@@ -1,11 +1,22 @@
-"""Gradient steps of hands on frozen matches, straight advances and depths: one thread a hand."""
+"""Gradient steps of hands on frozen matches, straight advances and depths."""
 
 import warp as wp
 
 from lgrasp.grasp.collision import plane_height
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
-from lgrasp.math.limits import MAX_BODIES
-from lgrasp.refine.energy_gradient import Search, joint_pulls, point_pulls, solid_pulls, wrench_pulls
+from lgrasp.math.lanes import lanes_sum, meet
+from lgrasp.refine.energy_gradient import (
+    Scratch,
+    Scratches,
+    Search,
+    gather_parts,
+    joint_pulls,
+    link_pulls,
+    point_pulls,
+    scratch_of,
+    solid_pulls,
+    wrench_pulls,
+)
 from lgrasp.refine.match_kernels import Correspondences, Points, Solids
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -14,7 +25,6 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 _TINY = wp.constant(1.0e-12)
 _SECOND_MOMENT_DECAY = wp.constant(0.99)  # decay of adam's second moment
-_BODIES = MAX_BODIES + 1
 _LAST_ADVANCE = 1.0e-5  # [m] an advance that is shorter is the last
 
 
@@ -26,6 +36,15 @@ class Schedule:
     skipped: wp.int32  # further steps that sizes fall by
     whole: wp.float32  # rounds of matching along which sizes fall
     gradient: wp.int32  # 1: take no step, leave the derivatives by translation, rotation and joints in the first moment
+
+
+@wp.struct
+class Parts:
+    """What pulls at hands."""
+
+    points: Points
+    solids: Solids
+    own: Volume
 
 
 @wp.struct
@@ -51,90 +70,122 @@ def _moved(moments: Moments, row: wp.int32, k: wp.int32, g: wp.float32, square: 
 
 
 @wp.func
-def _three_moved(moments: Moments, row: wp.int32, k: wp.int32, g: wp.vec3, step: wp.int32, s: Search):
-    """Of three coordinates; one scale for all: steps do not depend on the frame."""
-    square = wp.length_sq(g) / 3.0
-    v = g
-    if s.sgd == 1:
-        v = v / wp.max(wp.length(v), 1.0)
-    return wp.vec3(
-        _moved(moments, row, k, v[0], square, step, s),
-        _moved(moments, row, k + 1, v[1], square, step, s),
-        _moved(moments, row, k + 2, v[2], square, step, s),
-    )
-
-
-@wp.kernel
-def descend(
+def _gradient(
     h: Kinematics,
     points: Points,
     solids: Solids,
     own: Volume,
     s: Search,
     m: Correspondences,
+    row: wp.int32,
+    q: wp.array2d(dtype=wp.float32),
+    w: Scratch,
+):
+    """Write the derivatives of E* of a hand whose base is ``X[0]``: F and M of the base, and those by the joints."""
+    for g in range(w.lane, h.groups, w.lanes):
+        first = group_forward(h, g, group_dofs(h, g, q, row), w.X, 1 + h.joint_first[g])
+        for b in range(1 + first, 1 + h.joint_first[g + 1]):
+            w.X[b] = w.X[0] * w.X[b]
+    meet()
+    blocks = points.body.shape[0]
+    point_pulls(points, s, m, row, w)
+    wrench_pulls(points, own, s, m, row, blocks, w)
+    solid_pulls(solids, s, m, row, blocks + s.contacts, w)
+    meet()
+    gather_parts(blocks + s.contacts + solids.body.shape[0], 1 + h.joint_first[h.groups], w)
+    meet()
+    link_pulls(solids, s, m, row, w)
+    joint_pulls(h, s, q, row, w)
+
+
+@wp.func
+def _step(
+    s: Search,
     schedule: Schedule,
+    moments: Moments,
+    row: wp.int32,
+    k: wp.int32,
+    q: wp.array2d(dtype=wp.float32),
+    w: Scratch,
+):
+    """Take step k of a hand down the derivatives."""
+    centre = wp.transform_point(w.X[0], s.middle)
+    step = schedule.taken + k + 1
+    size = wp.pow(s.decay, float(schedule.skipped + schedule.taken + k) / (float(s.gradient_steps) * schedule.whole))
+    # one scale for all three coordinates: steps do not depend on the frame
+    for e in range(w.lane, 6, w.lanes):
+        g = w.F[0]
+        largest = s.max_translation_step
+        if e >= 3:
+            g = w.M[0] - wp.cross(centre, g)
+            largest = s.max_rotation_step
+        square = wp.length_sq(g) / 3.0
+        if s.sgd == 1:
+            g = g / wp.max(wp.length(g), 1.0)
+        w.moved[e] = largest * size * _moved(moments, row, e, g[e % 3], square, step, s)
+    scale = float(1.0)
+    if s.sgd == 1:
+        norm = float(0.0)
+        for c in range(w.lane, q.shape[1], w.lanes):
+            norm += w.by_q[c] * w.by_q[c]
+        scale = 1.0 / wp.max(wp.sqrt(lanes_sum(norm)), 1.0)
+    for c in range(w.lane, q.shape[1], w.lanes):
+        slope = w.by_q[c] * scale
+        x = q[row, c] + s.max_joint_step * size * _moved(moments, row, 6 + c, slope, slope * slope, step, s)
+        q[row, c] = wp.clamp(x, s.lower[c], s.upper[c])
+    meet()
+    if w.lane == 0:
+        T = w.X[0]
+        rotation = wp.vec3(w.moved[3], w.moved[4], w.moved[5])
+        angle = wp.length(rotation)
+        r = wp.quat_identity()
+        if angle > 1.0e-9:
+            r = wp.quat_from_axis_angle(rotation / angle, angle)
+        at = centre + wp.vec3(w.moved[0], w.moved[1], w.moved[2])
+        at += wp.quat_rotate(r, wp.transform_get_translation(T) - centre)
+        w.X[0] = wp.transform(at, wp.normalize(r * wp.transform_get_rotation(T)))
+    meet()
+
+
+@wp.kernel
+def descend(
+    h: Kinematics,
+    parts: Parts,
+    s: Search,
+    m: Correspondences,
+    schedule: Schedule,
+    scratch: Scratches,
     moments: Moments,
     pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
 ):
-    """``gradient_steps`` steps of hands, in place; launched over hands.
+    """``gradient_steps`` steps of hands, in place; launched over workers and their lanes.
 
     Args:
         pose: T_object_hand, moved in place, (N,).
         q: [rad or m], moved in place, (N, K).
     """
-    row = wp.tid()
-    X = wp.zeros(shape=(_BODIES,), dtype=wp.transform)
-    F = wp.zeros(shape=(_BODIES,), dtype=wp.vec3)
-    M = wp.zeros(shape=(_BODIES,), dtype=wp.vec3)
-    T = pose[row]
-    bodies = 1 + h.joint_first[h.groups]
-    for k in range(s.gradient_steps):
-        for b in range(bodies):
-            F[b] = wp.vec3()
-            M[b] = wp.vec3()
-        for g in range(h.groups):
-            group_forward(h, g, group_dofs(h, g, q, row), X, 1 + h.joint_first[g])
-        for b in range(1, bodies):
-            X[b] = T * X[b]
-        X[0] = T
-        point_pulls(points, s, m, row, X, F, M)
-        wrench_pulls(points, own, s, m, row, X, F, M)
-        solid_pulls(solids, s, m, row, X, F, M)
-        by_q = joint_pulls(h, s, q, row, X, F, M)
-        centre = wp.transform_point(T, s.middle)
-        by_shift = F[0]
-        by_turn = M[0] - wp.cross(centre, by_shift)
+    worker, lane = wp.tid()
+    w = scratch_of(scratch, worker, lane)
+    for row in range(worker, pose.shape[0], scratch.X.shape[0]):
+        if lane == 0:
+            w.X[0] = pose[row]
+        meet()
         if schedule.gradient == 1:
-            for e in range(3):
-                moments.first[row, e] = by_shift[e]
+            _gradient(h, parts.points, parts.solids, parts.own, s, m, row, q, w)
+            by_turn = w.M[0] - wp.cross(wp.transform_point(w.X[0], s.middle), w.F[0])
+            for e in range(lane, 3, w.lanes):
+                moments.first[row, e] = w.F[0][e]
                 moments.first[row, 3 + e] = by_turn[e]
-            for c in range(q.shape[1]):
-                moments.first[row, 6 + c] = by_q[c]
-            return
-        step = schedule.taken + k + 1
-        size = wp.pow(
-            s.decay, float(schedule.skipped + schedule.taken + k) / (float(s.gradient_steps) * schedule.whole)
-        )
-        translation = s.max_translation_step * size * _three_moved(moments, row, 0, by_shift, step, s)
-        rotation = s.max_rotation_step * size * _three_moved(moments, row, 3, by_turn, step, s)
-        scale = float(1.0)
-        if s.sgd == 1:
-            norm = float(0.0)
-            for c in range(q.shape[1]):
-                norm += by_q[c] * by_q[c]
-            scale = 1.0 / wp.max(wp.sqrt(norm), 1.0)
-        for c in range(q.shape[1]):
-            slope = by_q[c] * scale
-            x = q[row, c] + s.max_joint_step * size * _moved(moments, row, 6 + c, slope, slope * slope, step, s)
-            q[row, c] = wp.clamp(x, s.lower[c], s.upper[c])
-        angle = wp.length(rotation)
-        r = wp.quat_identity()
-        if angle > 1.0e-9:
-            r = wp.quat_from_axis_angle(rotation / angle, angle)
-        at = centre + translation + wp.quat_rotate(r, wp.transform_get_translation(T) - centre)
-        T = wp.transform(at, wp.normalize(r * wp.transform_get_rotation(T)))
-    pose[row] = T
+            for c in range(lane, q.shape[1], w.lanes):
+                moments.first[row, 6 + c] = w.by_q[c]
+        else:
+            for k in range(s.gradient_steps):
+                _gradient(h, parts.points, parts.solids, parts.own, s, m, row, q, w)
+                _step(s, schedule, moments, row, k, q, w)
+            if lane == 0:
+                pose[row] = w.X[0]
+        meet()
 
 
 @wp.kernel

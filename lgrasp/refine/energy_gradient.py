@@ -10,7 +10,7 @@ import warp as wp
 
 from lgrasp.grasp.collision import plane_height
 from lgrasp.math.kinematics import Kinematics
-from lgrasp.math.transforms import transforms, vec3s
+from lgrasp.math.lanes import lanes_least, lanes_sum, meet
 from lgrasp.refine.match_kernels import Correspondences, Points, Solids
 from lgrasp.refine.params import LENGTH, STEEPEST
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
@@ -25,7 +25,56 @@ _LOG_STEEPEST = math.log(STEEPEST)
 _PARABOLA_SLOPE = wp.constant(-2 * (STEEPEST - 1) * _LOG_STEEPEST - (STEEPEST - 1) ** 2 / STEEPEST)
 _PARABOLA_CONSTANT = wp.constant(-2 * _LOG_STEEPEST - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2)
 
-_vec_joints = wp.types.vector(MAX_COLUMNS, wp.float32)
+
+@wp.struct
+class Scratch:
+    """What the lanes of a hand share."""
+
+    lane: wp.int32
+    lanes: wp.int32
+    X: wp.array(dtype=wp.transform)  # (B,) T_object_body
+    F: wp.array(dtype=wp.vec3)  # (B,)
+    M: wp.array(dtype=wp.vec3)  # (B,)
+    part_body: wp.array(dtype=wp.int32)  # (parts,) of blocks of points, contacts, links
+    part_force: wp.array(dtype=wp.vec3)  # (parts,)
+    part_moment: wp.array(dtype=wp.vec3)  # (parts,)
+    by_joint: wp.array(dtype=wp.float32)  # (J,)
+    by_q: wp.array(dtype=wp.float32)  # (K,)
+    moved: wp.array(dtype=wp.float32)  # (6,) translation [m] and rotation [rad] of a step
+
+
+@wp.struct
+class Scratches:
+    """The arrays of W hands."""
+
+    lanes: wp.int32
+    X: wp.array2d(dtype=wp.transform)
+    F: wp.array2d(dtype=wp.vec3)
+    M: wp.array2d(dtype=wp.vec3)
+    part_body: wp.array2d(dtype=wp.int32)
+    part_force: wp.array2d(dtype=wp.vec3)
+    part_moment: wp.array2d(dtype=wp.vec3)
+    by_joint: wp.array2d(dtype=wp.float32)
+    by_q: wp.array2d(dtype=wp.float32)
+    moved: wp.array2d(dtype=wp.float32)
+
+
+@wp.func
+def scratch_of(every: Scratches, i: wp.int32, lane: wp.int32):
+    """Memory i, as a lane sees it."""
+    w = Scratch()
+    w.lane = lane
+    w.lanes = every.lanes
+    w.X = every.X[i]
+    w.F = every.F[i]
+    w.M = every.M[i]
+    w.part_body = every.part_body[i]
+    w.part_force = every.part_force[i]
+    w.part_moment = every.part_moment[i]
+    w.by_joint = every.by_joint[i]
+    w.by_q = every.by_q[i]
+    w.moved = every.moved[i]
+    return w
 
 
 @wp.struct
@@ -71,37 +120,12 @@ def _normal(plane: wp.vec4):
 
 
 @wp.func
-def wrench_pulls(
-    points: Points, own: Volume, s: Search, m: Correspondences, row: wp.int32, X: transforms, F: vec3s, M: vec3s
-):
-    """Of the net wrench of the contacts."""
-    force = wp.vec3()
-    torque = wp.vec3()
-    for c in range(s.contacts):
-        i = m.contacts[row, c]
-        x = wp.transform_point(X[points.body[i // points.block]], points.points[i])
-        n = _normal(volume_at(own, x))
-        force -= n
-        torque -= wp.cross((x - s.com) / s.radius, n)
-    for c in range(s.contacts):
-        i = m.contacts[row, c]
-        b = points.body[i // points.block]
-        x = wp.transform_point(X[b], points.points[i])
-        at = turning_normal(own, x)
-        by_n = -(force + wp.cross(torque, (x - s.com) / s.radius))
-        f = wp.vec3(wp.dot(at.by_x, by_n), wp.dot(at.by_y, by_n), wp.dot(at.by_z, by_n))
-        f = 2.0 * s.force * (f - wp.cross(at.n, torque) / s.radius)
-        F[b] = F[b] + f
-        M[b] = M[b] + wp.cross(x, f)
-
-
-@wp.func
-def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, X: transforms, F: vec3s, M: vec3s):
-    """Of the planes that points are drawn to and kept beyond."""
-    for block in range(points.body.shape[0]):
+def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, w: Scratch):
+    """Of the planes that points are drawn to and kept beyond: a part for each block."""
+    for block in range(w.lane, points.body.shape[0], w.lanes):
         b = points.body[block]
-        R = wp.quat_to_matrix(wp.transform_get_rotation(X[b]))
-        t = wp.transform_get_translation(X[b])
+        R = wp.quat_to_matrix(wp.transform_get_rotation(w.X[b]))
+        t = wp.transform_get_translation(w.X[b])
         total = wp.vec3()
         moment = wp.vec3()
         for i in range(block * points.block, (block + 1) * points.block):
@@ -120,69 +144,142 @@ def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, X:
                 moment += wp.cross(own, n) * (2.0 * s.normals * pull * (wp.dot(own, n) + 1.0))
             total += f
             moment += wp.cross(x, f)
-        F[b] = F[b] + total
-        M[b] = M[b] + moment
+        w.part_body[block] = b
+        w.part_force[block] = total
+        w.part_moment[block] = moment
 
 
 @wp.func
-def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, X: transforms, F: vec3s, M: vec3s):
-    """Of the object's points, and other links' points, that links are kept off."""
-    links = solids.body.shape[0]
-    each = m.deep.shape[1] // links
-    for i in range(m.deep.shape[1]):
-        plane = m.deep_plane[row, i]
-        b = solids.body[i // each]
-        x = m.deep[row, i]
-        u = plane_height(plane, wp.transform_point(wp.transform_inverse(X[b]), x)) / s.margin
-        if u < 1.0:
-            f = wp.transform_vector(X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.margin)
-            F[b] = F[b] - f
-            M[b] = M[b] - wp.cross(x, f)
-    pairs = solids.pairs.shape[0]
-    for i in range(m.link_plane.shape[1]):
-        plane = m.link_plane[row, i]
-        if wp.length_sq(_normal(plane)) > 0.0:
-            pair = solids.pairs[i * pairs // m.link_plane.shape[1]]
-            a = solids.body[pair[0]]
-            b = solids.body[pair[1]]
-            x = wp.transform_point(X[a], m.link_deep[row, i])
-            u = plane_height(plane, wp.transform_point(wp.transform_inverse(X[b]), x)) / s.link_margin
-            if u < 1.0:
-                f = wp.transform_vector(X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.link_margin)
-                F[a] = F[a] + f
-                M[a] = M[a] + wp.cross(x, f)
-                F[b] = F[b] - f
-                M[b] = M[b] - wp.cross(x, f)
-
-
-@wp.func
-def joint_pulls(
-    h: Kinematics, s: Search, q: wp.array2d(dtype=wp.float32), row: wp.int32, X: transforms, F: vec3s, M: vec3s
+def wrench_pulls(
+    points: Points, own: Volume, s: Search, m: Correspondences, row: wp.int32, first: wp.int32, w: Scratch
 ):
-    """Derivatives by the joints; F and M of a body become those of all that rides on it."""
-    g = _vec_joints()
-    for group in range(h.groups):
+    """Of the net wrench of the contacts: a part for each, from ``first`` on."""
+    force = wp.vec3()
+    torque = wp.vec3()
+    for c in range(w.lane, s.contacts, w.lanes):
+        i = m.contacts[row, c]
+        x = wp.transform_point(w.X[points.body[i // points.block]], points.points[i])
+        n = _normal(volume_at(own, x))
+        force -= n
+        torque -= wp.cross((x - s.com) / s.radius, n)
+    force = wp.vec3(lanes_sum(force[0]), lanes_sum(force[1]), lanes_sum(force[2]))
+    torque = wp.vec3(lanes_sum(torque[0]), lanes_sum(torque[1]), lanes_sum(torque[2]))
+    for c in range(w.lane, s.contacts, w.lanes):
+        i = m.contacts[row, c]
+        b = points.body[i // points.block]
+        x = wp.transform_point(w.X[b], points.points[i])
+        at = turning_normal(own, x)
+        by_n = -(force + wp.cross(torque, (x - s.com) / s.radius))
+        f = wp.vec3(wp.dot(at.by_x, by_n), wp.dot(at.by_y, by_n), wp.dot(at.by_z, by_n))
+        f = 2.0 * s.force * (f - wp.cross(at.n, torque) / s.radius)
+        w.part_body[first + c] = b
+        w.part_force[first + c] = f
+        w.part_moment[first + c] = wp.cross(x, f)
+
+
+@wp.func
+def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, first: wp.int32, w: Scratch):
+    """Of the object's points that links are kept off: a part for each link, from ``first`` on."""
+    each = m.deep.shape[1] // solids.body.shape[0]
+    for link in range(w.lane, solids.body.shape[0], w.lanes):
+        b = solids.body[link]
+        total = wp.vec3()
+        moment = wp.vec3()
+        for i in range(link * each, (link + 1) * each):
+            plane = m.deep_plane[row, i]
+            x = m.deep[row, i]
+            u = plane_height(plane, wp.transform_point(wp.transform_inverse(w.X[b]), x)) / s.margin
+            if u < 1.0:
+                f = wp.transform_vector(w.X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.margin)
+                total -= f
+                moment -= wp.cross(x, f)
+        w.part_body[first + link] = b
+        w.part_force[first + link] = total
+        w.part_moment[first + link] = moment
+
+
+@wp.func
+def gather_parts(count: wp.int32, bodies: wp.int32, w: Scratch):
+    """Force and moment of every body by its parts."""
+    for b in range(w.lane, bodies, w.lanes):
+        f = wp.vec3()
+        moment = wp.vec3()
+        for part in range(count):
+            if w.part_body[part] == b:
+                f += w.part_force[part]
+                moment += w.part_moment[part]
+        w.F[b] = f
+        w.M[b] = moment
+
+
+@wp.func
+def link_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, w: Scratch):
+    """Of other links' points that links are kept off, added to the bodies; few are near enough."""
+    pairs = solids.pairs.shape[0]
+    count = m.link_plane.shape[1]
+    for start in range(0, count, w.lanes):
+        i = start + w.lane
+        near = int(0)
+        a = int(0)
+        b = int(0)
+        f = wp.vec3()
+        x = wp.vec3()
+        if i < count:
+            plane = m.link_plane[row, i]
+            if wp.length_sq(_normal(plane)) > 0.0:
+                pair = solids.pairs[i * pairs // count]
+                a = solids.body[pair[0]]
+                b = solids.body[pair[1]]
+                x = wp.transform_point(w.X[a], m.link_deep[row, i])
+                u = plane_height(plane, wp.transform_point(wp.transform_inverse(w.X[b]), x)) / s.link_margin
+                if u < 1.0:
+                    near = 1
+                    f = wp.transform_vector(w.X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.link_margin)
+        if lanes_least(-near) < 0:
+            for turn in range(w.lanes):
+                if turn == w.lane and near == 1:
+                    w.F[a] = w.F[a] + f
+                    w.M[a] = w.M[a] + wp.cross(x, f)
+                    w.F[b] = w.F[b] - f
+                    w.M[b] = w.M[b] - wp.cross(x, f)
+                meet()
+
+
+@wp.func
+def joint_pulls(h: Kinematics, s: Search, q: wp.array2d(dtype=wp.float32), row: wp.int32, w: Scratch):
+    """Write the derivatives by the joints; F and M of a body become those of all that rides on it."""
+    for group in range(w.lane, h.groups, w.lanes):
         first = h.joint_first[group]
         count = h.joint_first[group + 1] - first
         for e in range(count):
-            j = count - 1 - e
-            k = first + j
-            f = F[1 + k]
-            moment = M[1 + k]
+            k = first + count - 1 - e
+            f = w.F[1 + k]
+            moment = w.M[1 + k]
             parent = h.joint_parent[k]
-            up = int(0)
             if parent >= 0:
                 up = 1 + first + parent
-            F[up] = F[up] + f
-            M[up] = M[up] + moment
-            axis = wp.transform_vector(X[1 + k], h.joint_axis[k])
+                w.F[up] = w.F[up] + f
+                w.M[up] = w.M[up] + moment
+            axis = wp.transform_vector(w.X[1 + k], h.joint_axis[k])
             slope = wp.dot(axis, f)
             if h.joint_prismatic[k] == 0:
-                slope = wp.dot(axis, moment - wp.cross(wp.transform_get_translation(X[1 + k]), f))
-            column = h.dof_index[h.dof_first[group] + h.joint_dof[k]]
-            g[column] = g[column] + h.joint_mult[k] * slope
-    for c in range(q.shape[1]):
+                slope = wp.dot(axis, moment - wp.cross(wp.transform_get_translation(w.X[1 + k]), f))
+            w.by_joint[k] = h.joint_mult[k] * slope
+    meet()
+    if w.lane == 0:
+        for group in range(h.groups):
+            first = h.joint_first[group]
+            for k in range(first, h.joint_first[group + 1]):
+                if h.joint_parent[k] < 0:
+                    w.F[0] = w.F[0] + w.F[1 + k]
+                    w.M[0] = w.M[0] + w.M[1 + k]
+    for c in range(w.lane, q.shape[1], w.lanes):
         low = _repulsion((q[row, c] - s.lower[c]) / s.near[c])
         high = _repulsion((s.upper[c] - q[row, c]) / s.near[c])
-        g[c] = g[c] + s.limits * (low - high) / s.near[c]
-    return g
+        g = s.limits * (low - high) / s.near[c]
+        for group in range(h.groups):
+            for k in range(h.joint_first[group], h.joint_first[group + 1]):
+                if h.dof_index[h.dof_first[group] + h.joint_dof[k]] == c:
+                    g += w.by_joint[k]
+        w.by_q[c] = g
+    meet()

@@ -6,6 +6,7 @@ Rows are hands; everything is frozen until it is matched again (:mod:`lgrasp.ref
 import warp as wp
 
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
+from lgrasp.math.lanes import lanes_least, lanes_max, lanes_sum, meet
 from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_part, sdf_value
 from lgrasp.refine.volume import Volume, volume_at
@@ -19,6 +20,7 @@ DEEPEST, LINK_DEEPEST = 4, 2
 NO_PLANE = -1.0  # [m] offset of a plane that nothing is near
 _FAR_DISTANCE = 1.0e9  # [m]
 _HALVINGS = 40
+_NONE = wp.constant(0x7FFFFFFF)  # beyond all points
 
 _vec_block = wp.types.vector(32, wp.float32)
 _vec_deep = wp.types.vector(DEEPEST, wp.float32)
@@ -148,50 +150,63 @@ def match_points(
 
 @wp.kernel
 def choose_contacts(
-    points: Points, nearest: wp.int32, count: wp.int32, body: wp.array2d(dtype=wp.transform), m: Correspondences
+    points: Points,
+    nearest: wp.int32,
+    count: wp.int32,
+    lanes: wp.int32,
+    body: wp.array2d(dtype=wp.transform),
+    m: Correspondences,
 ):
-    """Farthest points among the ``nearest`` nearest palmar ones, the nearest first; launched over hands.
+    """Farthest points among the ``nearest`` nearest palmar ones, the nearest first; launched over hands and lanes.
 
     Args:
         body: T_object_body, (N, B).
     """
-    row = wp.tid()
-    best = int(0)
-    low = float(_FAR_DISTANCE)
-    high = float(-_FAR_DISTANCE)
-    for k in range(points.palmar.shape[0]):
+    row, lane = wp.tid()
+    own_best = points.palmar[0]
+    own_low = float(_FAR_DISTANCE)
+    own_high = float(-_FAR_DISTANCE)
+    for k in range(lane, points.palmar.shape[0], lanes):
         d = m.distance[row, points.palmar[k]]
-        if d < low:
-            low = d
-            best = points.palmar[k]
-        high = wp.max(high, d)
+        if d < own_low:
+            own_low = d
+            own_best = points.palmar[k]
+        own_high = wp.max(own_high, d)
+    high = lanes_max(own_high)
+    low = -lanes_max(-own_low)
+    best = lanes_least(wp.where(own_low == low, own_best, _NONE))
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        within = int(0)
-        for k in range(points.palmar.shape[0]):
+        within = float(0.0)
+        for k in range(lane, points.palmar.shape[0], lanes):
             if m.distance[row, points.palmar[k]] <= middle:
-                within += 1
-        if within >= nearest:
+                within += 1.0
+        if lanes_sum(within) >= float(nearest):
             high = middle
         else:
             low = middle
-    m.contacts[row, 0] = best
-    for c in range(1, count):
-        farthest = float(-1.0)
-        chosen = best
-        for k in range(points.palmar.shape[0]):
-            i = points.palmar[k]
-            if m.distance[row, i] <= high:
-                x = wp.transform_point(body[row, points.body[i // points.block]], points.points[i])
-                gap = float(_FAR_DISTANCE)
-                for e in range(c):
-                    o = m.contacts[row, e]
-                    y = wp.transform_point(body[row, points.body[o // points.block]], points.points[o])
-                    gap = wp.min(gap, wp.length_sq(x - y))
-                if gap > farthest:
-                    farthest = gap
-                    chosen = i
-        m.contacts[row, c] = chosen
+    chosen = best
+    for c in range(count):
+        if c > 0:
+            own_farthest = float(-1.0)
+            own_chosen = best
+            for k in range(lane, points.palmar.shape[0], lanes):
+                i = points.palmar[k]
+                if m.distance[row, i] <= high:
+                    x = wp.transform_point(body[row, points.body[i // points.block]], points.points[i])
+                    gap = float(_FAR_DISTANCE)
+                    for e in range(c):
+                        o = m.contacts[row, e]
+                        y = wp.transform_point(body[row, points.body[o // points.block]], points.points[o])
+                        gap = wp.min(gap, wp.length_sq(x - y))
+                    if gap > own_farthest:
+                        own_farthest = gap
+                        own_chosen = i
+            farthest = lanes_max(own_farthest)
+            chosen = lanes_least(wp.where(own_farthest == farthest, own_chosen, _NONE))
+        if lane == 0:
+            m.contacts[row, c] = chosen
+        meet()
 
 
 @wp.func

@@ -1,5 +1,7 @@
 """A planner whose hands start where networks draw them."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.learn.grasp.file import Networks
@@ -27,6 +29,8 @@ def predicted_planner(
         palmar, around: as of :class:`Planner`.
     """
     predictor = GraspPredictor(hand.model.tree, networks, model.contact_points, model.contact_normals, hand.device)
-    guesses = Guesses(*predictor.draw(starts * params.draws, seed))
-    whole = model if len(model.faces) else predictor.completed(model, params.thicker)
-    return Planner(hand, whole, 0.0, params, palmar, around, guesses)
+    _ = predictor.grid  # both threads need it
+    with ThreadPoolExecutor(1) as pool:
+        drawn = pool.submit(predictor.draw, starts * params.draws, seed)
+        whole = model if len(model.faces) else predictor.completed(model, params.thicker)
+    return Planner(hand, whole, 0.0, params, palmar, around, Guesses(*drawn.result()))

@@ -86,6 +86,11 @@ class SampleJob(SampleRequest, SequenceJob):
         sampler = StepSampler(inputs.hand.tree, net, about.params.process, clouds, grids, alias)
         return replace(inputs, sampler=sampler)
 
+    def warm(self) -> None:
+        params = self.pipeline.params("sequence")
+        assert self.inputs.sampler is not None
+        self.inputs.sampler.warm(params.width, params.wave if params.in_waves else 1)
+
     def clouds_by_key(self) -> dict[str, Callable[[], ObjectModel]]:
         if not self._clouds:
             return {}

@@ -177,6 +177,17 @@ class StepSampler:
         pose, q = (torch.cat(x)[:count].cpu().numpy() for x in zip(*parts, strict=True))
         return DrawnSteps(pose, q)
 
+    def warm(self, rows: int, each: int) -> None:
+        """Draw as for ``rows`` hands, empty ones and those that hold something: a GPU loads what it runs when it first
+        does, which takes longer than the draws."""
+        if self._device.type == "cpu":
+            return
+        joints = len(self._net.lower)
+        for number in range(min(2, len(self._clouds))):
+            pose = np.tile(np.eye(7, dtype=np.float32)[6], (rows, number, 1))
+            hands = HeldHands(np.zeros((rows, joints), np.float32), np.zeros((rows, joints), bool), pose)
+            self.draw(hands, np.zeros(rows, int), ~hands.used, each=each, seed=0, steps=2)
+
     def _held(self, hands: HeldHands, number: int) -> HeldObjects:
         objects = torch.arange(number, device=self._device).expand(len(hands.q), number)
         return HeldObjects(objects, *motion_from_pose(self._put(hands.pose)))
