@@ -8,6 +8,8 @@ from lgrasp.math.kinematics import vec_dof
 
 FURTHER = wp.constant(2)
 """Most further contacts of a candidate: those of other links of its finger."""
+vec_further = wp.types.vector(2 * int(FURTHER), wp.int32)
+"""Contact points of the object, -1 none, then those of the hand that stand for the links."""
 
 
 class State(IntEnum):
@@ -43,7 +45,7 @@ class Candidates:
     record: wp.array3d(dtype=wp.int32)  # (P, G, M) contact vector of the field
     state: wp.array3d(dtype=wp.int32)  # (P, G, M) State
     q: wp.array3d(dtype=vec_dof)  # (P, G, M) joint seed or realised posture [rad or m]
-    further: wp.array3d(dtype=wp.vec2i)  # (P, G, M) object contact points of other links, -1 none; or (0, 0, 0)
+    further: wp.array3d(dtype=vec_further)  # (P, G, M) contacts of other links; or (0, 0, 0)
 
 
 @wp.func

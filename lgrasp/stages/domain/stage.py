@@ -5,6 +5,7 @@ import math
 import warp as wp
 
 from lgrasp.field.arrays import Boxes
+from lgrasp.grasp.structs import vec_further
 from lgrasp.grasp.tables import CandidateTable, PoseTable
 from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
@@ -39,7 +40,7 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
     else:
         n = inputs.index.shape[0]
         count, state = (wp.zeros((n, groups, params.keep)[:axes], dtype=wp.int32, device=d) for axes in (2, 3))
-        none = wp.empty((0, 0, 0), dtype=wp.vec2i, device=d)
+        none = wp.empty((0, 0, 0), dtype=vec_further, device=d)
         table = CandidateTable.empty(d, n, groups, params.keep, poses=inputs, count=count, state=state, further=none)
         realised = wp.empty((0, 0), dtype=wp.int32, device=d)
     hand, field, boxes = context.hand.struct, context.field.struct, context.field.boxes

@@ -9,6 +9,7 @@ from lgrasp.grasp.collision import body_clear, body_height, resting_plane
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
 from lgrasp.grasp.outcomes import CONTACT, KEPT, OBJECT_COLLISION, SELF_COLLISION, UNUSED_FINGER
+from lgrasp.grasp.structs import FURTHER, vec_further
 from lgrasp.hand.arrays import Hand, thumb_placed
 from lgrasp.math.kinematics import clamp_dofs, group_forward, vec_dof
 from lgrasp.object.arrays import Object
@@ -27,6 +28,7 @@ class SetCandidates:
     surface: wp.array3d(dtype=wp.int32)  # (P, G, M) place on the object
     record: wp.array3d(dtype=wp.int32)  # (P, G, M) record of the field
     q: wp.array3d(dtype=vec_dof)  # (P, G, M) [rad or m]
+    further: wp.array3d(dtype=vec_further)  # (P, G, M) contacts of other links of the finger; or (0, 0, 0)
 
 
 @wp.kernel
@@ -54,7 +56,8 @@ def place_touching(
 ):
     """Postures and bodies of the touching fingers; contacts on the links' true meshes; collisions among these fingers.
 
-    Contacts come in group order, that of the palm (or of a finger that stays as it is) last; unused places hold -1.
+    Contacts come in group order, that of the palm (or of a finger that stays as it is) after them, then those of other
+    links; unused places hold -1.
     """
     i = wp.tid()
     row = at_out.of[i]
@@ -87,6 +90,16 @@ def place_touching(
             at_out.contact[i, k] = c
             at_out.surface[i, k] = s
             k += 1
+    if sets.further.shape[2] > 0:
+        for f in range(FURTHER):
+            for g in range(G):
+                m = at_out.chosen[i, g]
+                if m >= 0 and k < at_out.contact.shape[1]:
+                    s = sets.further[row, g, wp.max(m, 0)][f]
+                    if s >= 0:
+                        at_out.contact[i, k] = sets.further[row, g, wp.max(m, 0)][FURTHER + f]
+                        at_out.surface[i, k] = s
+                        k += 1
     fit = fit_contacts(hand, places, at_out, i)
     found_out.gap[i] = fit[0]
     found_out.facing[i] = fit[1]

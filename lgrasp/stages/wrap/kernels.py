@@ -9,7 +9,7 @@ from lgrasp.field.arrays import Field
 from lgrasp.grasp.collision import body_clear, body_far, finger_above, resting_plane
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, body_clear_of_held
-from lgrasp.grasp.structs import FURTHER, Candidates, State
+from lgrasp.grasp.structs import FURTHER, Candidates, State, vec_further
 from lgrasp.hand.arrays import Hand, thumb_placed
 from lgrasp.math.cholesky import solving
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
@@ -17,7 +17,7 @@ from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
 from lgrasp.math.sdf import sdf_gradient, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.wrap.touch import LinkTouch, WrapValues, contact_beside, fits, nearest_touch
+from lgrasp.stages.wrap.touch import LinkTouch, WrapValues, contact_beside, fits, nearest_touch, touches_there
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -122,7 +122,7 @@ def list_realised(
     row, g, m = wp.tid()
     if m >= candidates_out.count[row, g]:
         return
-    candidates_out.further[row, g, m] = wp.vec2i(-1, -1)
+    candidates_out.further[row, g, m] = vec_further(-1)
     if candidates_out.state[row, g, m] == State.REALISED:
         i = wp.atomic_add(counts_out, int(WrapCount.TRIED), 1)
         shape = candidates_out.state.shape
@@ -263,7 +263,7 @@ def _wrapping(size: int) -> Any:
         indentation)^2 + w^2 |normals|^2 + damping |dq|^2 over those asked; g_l is the distance of link and object, n_l
         the object's normal there. Contacts, the first one too, are free to slide; other links are pushed off the
         object. ``surface`` and ``q`` of a candidate follow its first contact, ``further`` are the others. Candidates
-        whose finger is not clear in either posture are blocked.
+        whose finger is not clear, or does not touch by its mesh, in either posture are blocked.
 
         Args:
             runs: points of links that may touch.
@@ -324,7 +324,7 @@ def _wrapping(size: int) -> Any:
         clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
         if made > 0 and clear:
             surface = int(-1)
-            further = wp.vec2i(-1, -1)
+            further = vec_further(-1)
             more = int(0)
             for i in range(n):
                 if task[i] == _ASKED and (i == first or more < FURTHER):
@@ -335,6 +335,7 @@ def _wrapping(size: int) -> Any:
                         surface = at
                     elif at >= 0:
                         further[more] = at
+                        further[FURTHER + more] = runs.place[found[i].run]
                         more += 1
             if surface >= 0 and more > 0:
                 candidates_out.q[row, g, m] = posture
@@ -345,7 +346,11 @@ def _wrapping(size: int) -> Any:
         if made > 0:
             group_forward(hand.kin, g, candidates_out.q[row, g, m], X, 0)
             clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
-        if not clear:
+        c = field.point[candidates_out.record[row, g, m]]
+        T = T_object * X[hand.contacts.body[c] - 1 - j0]
+        if not clear or not touches_there(
+            hand, obj, params, hand.contacts.grid[c], T, candidates_out.surface[row, g, m]
+        ):
             candidates_out.state[row, g, m] = State.BLOCKED
 
     return wrap_fingers

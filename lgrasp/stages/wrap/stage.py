@@ -8,6 +8,7 @@ import warp as wp
 
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.find_contacts import palmar_runs
+from lgrasp.grasp.structs import vec_further
 from lgrasp.grasp.tables import CandidateTable
 from lgrasp.hand.contact_surface import contact_surface
 from lgrasp.refine.surface import farthest_points
@@ -18,7 +19,7 @@ from lgrasp.stages.wrap.kernels import WrapCount, list_realised, wrap_fingers
 from lgrasp.stages.wrap.params import WrapParams
 from lgrasp.stages.wrap.touch import WrapValues
 
-VERSION = 1
+VERSION = 2
 
 _PROBES = 24  # points of a link from which its nearest one is looked for
 _NORMAL_MARGIN = 2.0  # [deg] below the bound of the normals
@@ -32,9 +33,15 @@ def run(inputs: CandidateTable, params: WrapParams, context: Context) -> tuple[C
     """
     d = context.device
     tally = empty_tally(WrapCount, d)
-    table = replace(inputs, further=wp.empty(inputs.surface.shape, dtype=wp.vec2i, device=d))
-    cosine = math.cos(math.radians(context.bounds.max_normal_angle - _NORMAL_MARGIN))
-    values = make_struct(WrapValues, params, context.bounds, cosine=cosine)
+    table = replace(inputs, further=wp.empty(inputs.surface.shape, dtype=vec_further, device=d))
+    bounds = context.bounds
+    angles = {
+        "cosine": bounds.max_normal_angle - _NORMAL_MARGIN,
+        "min_cosine": bounds.max_normal_angle,
+        "min_spread_cosine": bounds.max_normal_spread,
+    }
+    least = {name: math.cos(math.radians(angle)) for name, angle in angles.items()}
+    values = make_struct(WrapValues, params, bounds, **least)
     asked = [context.hand.struct, context.field.struct, context.object.struct, context.held.struct, _probes(context)]
     shape, listed = inputs.surface.shape, wp.empty(inputs.surface.size, dtype=wp.int32, device=d)
     wp.launch(list_realised, shape, [table.struct], [listed, tally.device], device=d)

@@ -32,6 +32,8 @@ class WrapValues:
     gap: wp.float32  # [m]
     cosine: wp.float32  # least, of the normals
     max_gap: wp.float32  # [m]
+    min_cosine: wp.float32  # of the bounds
+    min_spread_cosine: wp.float32  # of the object's normals about a contact
     allowed_penetration: wp.float32  # [m] of inner spheres
     min_self_distance: wp.float32  # [m]
     min_table_distance: wp.float32  # [m]
@@ -86,6 +88,13 @@ def fits(hand: Hand, runs: PalmarRuns, params: WrapValues, T: wp.transform, touc
 
 
 @wp.func
+def touches_there(hand: Hand, obj: Object, params: WrapValues, grid: wp.int32, T: wp.transform, k: wp.int32):
+    """True if a link's mesh touches contact point k of the object as the filter will ask. T = T_object_body."""
+    fit = contact_fit(hand, grid, T, obj.contact_points[k], -obj.contact_normals[k])
+    return fit[0] < params.max_gap and wp.min(fit[1], fit[2]) > params.min_cosine
+
+
+@wp.func
 def contact_beside(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues, T: wp.transform, touch: LinkTouch):
     """Contact point of the object that stands for a touch, -1 if none near by is a contact of the link's mesh."""
     best = int(-1)
@@ -98,11 +107,9 @@ def contact_beside(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues
             s = sdf_gradient(sdf, wp.transform_point(T_body, p))
             facing = -wp.dot(wp.transform_vector(T, wp.vec3(s[0], s[1], s[2])), obj.contact_normals[k])
             worth = facing - _GAP_WEIGHT * wp.abs(s[3])
-            if facing > params.cosine and wp.abs(s[3]) < params.max_gap and (best < 0 or worth > least):
-                least = worth
-                best = k
-    if best >= 0:
-        fit = contact_fit(hand, runs.grid[touch.run], T, obj.contact_points[best], -obj.contact_normals[best])
-        if fit[0] > params.max_gap or wp.min(fit[1], fit[2]) < params.cosine:
-            best = int(-1)
+            plain = wp.dot(obj.contact_normals[k], touch.normal) > params.min_spread_cosine
+            if plain and facing > params.cosine and wp.abs(s[3]) < params.max_gap and (best < 0 or worth > least):
+                if touches_there(hand, obj, params, runs.grid[touch.run], T, k):
+                    least = worth
+                    best = k
     return best
