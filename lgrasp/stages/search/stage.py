@@ -38,6 +38,7 @@ VERSION = 11
 
 _CPU_STARTS = 2  # of a pose in one launch
 _GPU_STARTS = 10  # and on every device where what is left out of later starts depends on it
+_MOST_STARTS = 40  # there: as many as came before, so that many starts take few launches
 
 
 def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple[ContactSets, Tally]:
@@ -70,16 +71,18 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     paced = exact or (swap and context.bounds.max_unresisted_load < 1.0)
     few = _CPU_STARTS if d == "cpu" and not paced else _GPU_STARTS
     lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
-    tried = empty_struct(TriedSets, d, n, lanes, groups)
-    for first in range(0, params.restarts, lanes):
-        if first + lanes > params.restarts:
-            tried.score = tried.score[:, : params.restarts - first]
+    room = empty_struct(TriedSets, d, n, min(params.restarts, max(lanes, _MOST_STARTS)) if paced else lanes, groups)
+    first = 0
+    while first < params.restarts:
+        lanes = min(max(lanes, min(first, _MOST_STARTS if paced else 0)), params.restarts - first)
+        tried = make_struct(TriedSets, room, score=room.score[:, :lanes])
         values.per_pose = params.per_pose - (params.taper * params.per_pose * first) // params.restarts
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
         wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
         if swap:
             _check_sets(tried, usable, values, inputs, context, exact, first == 0)
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
+        first += lanes
     upto = wp.clone(found.number)
     running_sums(upto)
     table = ContactSets.empty(d, n * params.per_pose, groups, candidates=inputs)
