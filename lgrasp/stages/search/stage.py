@@ -68,13 +68,13 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     wp.launch(list_usable, (n, groups), [obj, int(state), inputs.struct], [usable], device=d)
     kernel = (swap_contacts if swap else mutate_contacts)[params.score]
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
-    paced = exact or (swap and context.bounds.max_unresisted_load < 1.0)
+    paced = exact or (swap and _bounds_load(values))
     few = _CPU_STARTS if d == "cpu" and not paced else _GPU_STARTS
     lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
     room = empty_struct(TriedSets, d, n, min(params.restarts, max(lanes, _MOST_STARTS)) if paced else lanes, groups)
     first = 0
     while first < params.restarts:
-        lanes = min(max(lanes, min(first, _MOST_STARTS if paced else 0)), params.restarts - first)
+        lanes = min(max(lanes, min(first // 2, _MOST_STARTS if paced else 0)), params.restarts - first)
         tried = make_struct(TriedSets, room, score=room.score[:, :lanes])
         values.per_pose = params.per_pose - (params.taper * params.per_pose * first) // params.restarts
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
@@ -110,7 +110,7 @@ def _check_sets(
         wp.launch(kernel, dim, [hits, *asked], outputs, device=d)
 
     sets = [obj, values, inputs.struct]
-    if values.max_unresisted_load < 1.0:
+    if _bounds_load(values):
         # most fail in the hardest direction: it comes alone
         for some, directions in ((0, 1), (1, LOAD_DIRECTIONS - 1)):
             check(check_load, (size, directions), [obj, values, some, inputs.struct], [tried])
@@ -125,6 +125,11 @@ def _check_sets(
         check(find_sunk, (slices, bodies, size), [hand, *sets, tried, slices], [usable])
         wp.launch(check_depth, size, [hits], [tried, usable], device=d)
         wp.launch(drop_sunk, usable.size.shape, [], [usable], device=d)
+
+
+def _bounds_load(values: Any) -> bool:
+    """Whether grasps must resist pulls at all."""
+    return values.max_unresisted_load < 1.0
 
 
 def _values(params: SearchParams, context: Context) -> Any:
