@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.look_up import look_up
+from support.look_up import look_up, look_up_limits
 from support.sdf import trilinear, trilinear_gradient
 
 SHAPE, CELL, ORIGIN, RADIUS = (21, 26, 31), 0.004, np.array([-0.04, -0.05, -0.06]), 0.02
@@ -76,3 +76,15 @@ def test_flat_grid_has_no_direction_but_is_finite(device):
     value, gradient = look_up(device, np.full(SHAPE, 0.01), ORIGIN, CELL, inside(50, 5))
     np.testing.assert_allclose(value, 0.01)
     assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("blocks", [True, False])
+@pytest.mark.parametrize("limit", [-0.004, 0.0, 0.011])
+def test_limits_are_those_of_the_values(device, blocks, limit):
+    """A ball; points inside and outside of the grid."""
+    values = np.linalg.norm(nodes(), axis=-1) - RADIUS
+    p = np.random.default_rng(5).uniform(-0.09, 0.09, (20_000, 3))
+    value, _ = look_up(device, values, ORIGIN, CELL, p)
+    below, depth = look_up_limits(device, values, ORIGIN, CELL, p, limit, blocks=blocks)
+    np.testing.assert_array_equal(below, value < np.float32(limit))
+    np.testing.assert_array_equal(depth, np.maximum(-value, np.float32(limit)))
