@@ -47,6 +47,7 @@ def _best_direction(a: wp.vec3, n: wp.vec3, mu: wp.float32, edges: wp.int32):
         return n
     if edges == 0:
         across = a - n * wp.dot(a, n)
+        across = across - n * wp.dot(across, n)  # of what rounding leaves along n where little is across
         s = wp.length(across)
         if s < 1.0e-12:
             return n

@@ -133,6 +133,17 @@ def test_later_passes_draw_others(tables, context, swift):
     assert len(rows[1] - rows[0]) > 10
 
 
+def test_later_starts_are_for_poses_with_few_sets(tables, context, swift):
+    def sets(taper):
+        how = {"restarts": 40, "per_pose": 4, "taper": taper}
+        table, _ = run(tables.ik, swift.params("search").model_copy(update=how), context)
+        return np.bincount(table.arrays()["pose"], minlength=len(tables.place))
+
+    few, all_ = sets(True), sets(False)
+    assert 0 < few.sum() < all_.sum()
+    assert ((few > 0) == (all_ > 0)).all()
+
+
 def test_gswo_score(tables, context, swift, inputs, device_matrix):
     """With friction in the score more sets count as balanced; each still meets the bound."""
     params = swift.params("search").model_copy(update={"score": "gswo"})
