@@ -103,7 +103,8 @@ def _drawing(voxels: bool) -> Any:
             return
         n = int(0)
         if params.round > 0:
-            if realised[row, g] >= wp.min(params.enough, params.keep) or _touching(poses, realised, row) < params.fingers:
+            enough = realised[row, g] >= wp.min(params.enough, params.keep)
+            if enough or _touching(poses, realised, row) < params.fingers:
                 return
             for m in range(candidates_out.count[row, g]):
                 if candidates_out.state[row, g, m] == State.REALISED:

@@ -346,11 +346,12 @@ def _wrapping(size: int) -> Any:
         if made > 0:
             group_forward(hand.kin, g, candidates_out.q[row, g, m], X, 0)
             clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
-        c = field.point[candidates_out.record[row, g, m]]
-        T = T_object * X[hand.contacts.body[c] - 1 - j0]
-        if not clear or not touches_there(
-            hand, obj, params, hand.contacts.grid[c], T, candidates_out.surface[row, g, m]
-        ):
+        if clear:
+            c = field.point[candidates_out.record[row, g, m]]
+            T = T_object * X[hand.contacts.body[c] - 1 - j0]
+            at = candidates_out.surface[row, g, m]
+            clear = touches_there(hand, obj, params, hand.contacts.grid[c], T, at)
+        if not clear:
             candidates_out.state[row, g, m] = State.BLOCKED
 
     return wrap_fingers

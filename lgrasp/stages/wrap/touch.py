@@ -107,9 +107,13 @@ def contact_beside(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues
             s = sdf_gradient(sdf, wp.transform_point(T_body, p))
             facing = -wp.dot(wp.transform_vector(T, wp.vec3(s[0], s[1], s[2])), obj.contact_normals[k])
             worth = facing - _GAP_WEIGHT * wp.abs(s[3])
-            plain = wp.dot(obj.contact_normals[k], touch.normal) > params.min_spread_cosine
-            if plain and facing > params.cosine and wp.abs(s[3]) < params.max_gap and (best < 0 or worth > least):
-                if touches_there(hand, obj, params, runs.grid[touch.run], T, k):
-                    least = worth
-                    best = k
+            if best >= 0 and worth <= least:
+                continue
+            if facing <= params.cosine or wp.abs(s[3]) >= params.max_gap:
+                continue
+            if wp.dot(obj.contact_normals[k], touch.normal) <= params.min_spread_cosine:
+                continue
+            if touches_there(hand, obj, params, runs.grid[touch.run], T, k):
+                least = worth
+                best = k
     return best
