@@ -61,10 +61,11 @@ def make_columns(hand: Hand, w: Scratch, count: wp.int32):
             a = b - 1 - j0
             while a >= 0:
                 d = hand.kin.joint_dof[j0 + a]
-                w.column[c * MAX_DOFS + d] += point_column(hand.kin, j0 + a, w.X[j0 + a], w.contacts[c].point)
+                at = c * MAX_DOFS + d
+                w.column[at] = w.column[at] + point_column(hand.kin, j0 + a, w.X[j0 + a], w.contacts[c].point)
                 if hand.kin.joint_prismatic[j0 + a] == 0:
                     axis = wp.transform_vector(w.X[j0 + a], hand.kin.joint_axis[j0 + a])
-                    w.spin[c * MAX_DOFS + d] += hand.kin.joint_mult[j0 + a] * wp.dot(axis, w.contacts[c].normal)
+                    w.spin[at] = w.spin[at] + hand.kin.joint_mult[j0 + a] * wp.dot(axis, w.contacts[c].normal)
                 a = hand.kin.joint_parent[j0 + a]
 
 

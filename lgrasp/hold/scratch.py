@@ -16,8 +16,6 @@ MAX_HAND_DOFS = MAX_GROUPS * MAX_DOFS
 """Most dofs of all groups together."""
 MAX_TAGS = 4
 """Most contacts of a link."""
-OBJECT_TERMS = 27
-"""Numbers of the object's part of a system: the lower triangle of 6 x 6 row by row, then the gradient."""
 _ROWS = MAX_HAND_DOFS + MAX_DOFS  # those of the shared joints come last
 
 
@@ -60,7 +58,8 @@ class Scratch:
     Z: wp.array(dtype=wp.vec4)  # (MAX_TOUCHES,) that of an iteration
     press: wp.array(dtype=wp.float32)  # (MAX_TOUCHES,) forces [N]
     terms: wp.array(dtype=Terms)  # (MAX_TOUCHES,)
-    on_object: wp.array(dtype=wp.float32)  # (MAX_TOUCHES * OBJECT_TERMS,) what contacts add to the object's part
+    object_rows: wp.array(dtype=wp.spatial_vector)  # (MAX_TOUCHES * 6,) what contacts add to C
+    object_slope: wp.array(dtype=wp.float32)  # (MAX_TOUCHES * 6,) and to the object's gradient
     column: wp.array(dtype=wp.vec3)  # (MAX_TOUCHES * MAX_DOFS,) see make_columns
     spin: wp.array(dtype=wp.float32)  # (MAX_TOUCHES * MAX_DOFS,)
     X: wp.array(dtype=wp.transform)  # (MAX_BODIES,) T_base_body of bodies 1, 2, ...
@@ -71,9 +70,11 @@ class Scratch:
     group: wp.array(dtype=wp.int32)  # (MAX_HAND_DOFS,) of each dof
     step: wp.array(dtype=wp.float32)  # (rows,) gradient, then step of an iteration
     A: wp.array(dtype=wp.float32)  # (rows * MAX_DOFS,) see lgrasp.hold.system
-    B: wp.array(dtype=wp.float32)  # (rows * 7,)
-    C: wp.array(dtype=wp.float32)  # (OBJECT_TERMS,)
-    g: wp.array(dtype=wp.float32)  # (6,) the gradient, as it was
+    B: wp.array(dtype=wp.spatial_vector)  # (rows,)
+    b: wp.array(dtype=wp.float32)  # (rows,)
+    C: wp.array(dtype=wp.spatial_vector)  # (6,)
+    c: wp.array(dtype=wp.float32)  # (6,)
+    slope: wp.array(dtype=wp.float32)  # (6,) the object's gradient
 
 
 @wp.struct
@@ -87,7 +88,8 @@ class Scratches:
     Z: wp.array2d(dtype=wp.vec4)
     press: wp.array2d(dtype=wp.float32)
     terms: wp.array2d(dtype=Terms)
-    on_object: wp.array2d(dtype=wp.float32)
+    object_rows: wp.array2d(dtype=wp.spatial_vector)
+    object_slope: wp.array2d(dtype=wp.float32)
     column: wp.array2d(dtype=wp.vec3)
     spin: wp.array2d(dtype=wp.float32)
     X: wp.array2d(dtype=wp.transform)
@@ -98,9 +100,11 @@ class Scratches:
     group: wp.array2d(dtype=wp.int32)
     step: wp.array2d(dtype=wp.float32)
     A: wp.array2d(dtype=wp.float32)
-    B: wp.array2d(dtype=wp.float32)
-    C: wp.array2d(dtype=wp.float32)
-    g: wp.array2d(dtype=wp.float32)
+    B: wp.array2d(dtype=wp.spatial_vector)
+    b: wp.array2d(dtype=wp.float32)
+    C: wp.array2d(dtype=wp.spatial_vector)
+    c: wp.array2d(dtype=wp.float32)
+    slope: wp.array2d(dtype=wp.float32)
 
 
 _SIZES = {
@@ -108,13 +112,11 @@ _SIZES = {
     **dict.fromkeys(("column", "spin"), MAX_TOUCHES * MAX_DOFS),
     **dict.fromkeys(("q", "dq", "target", "scale", "group"), MAX_HAND_DOFS),
     "made": MAX_TAGS,
-    "on_object": MAX_TOUCHES * OBJECT_TERMS,
+    **dict.fromkeys(("object_rows", "object_slope"), MAX_TOUCHES * 6),
     "X": MAX_BODIES,
-    "step": _ROWS,
+    **dict.fromkeys(("step", "B", "b"), _ROWS),
     "A": _ROWS * MAX_DOFS,
-    "B": _ROWS * 7,
-    "C": OBJECT_TERMS,
-    "g": 6,
+    **dict.fromkeys(("C", "c", "slope"), 6),
 }
 
 
@@ -138,7 +140,8 @@ def scratch_of(every: Scratches, i: wp.int32, lane: wp.int32, lanes: wp.int32):
     w.Z = every.Z[i]
     w.press = every.press[i]
     w.terms = every.terms[i]
-    w.on_object = every.on_object[i]
+    w.object_rows = every.object_rows[i]
+    w.object_slope = every.object_slope[i]
     w.column = every.column[i]
     w.spin = every.spin[i]
     w.X = every.X[i]
@@ -150,6 +153,8 @@ def scratch_of(every: Scratches, i: wp.int32, lane: wp.int32, lanes: wp.int32):
     w.step = every.step[i]
     w.A = every.A[i]
     w.B = every.B[i]
+    w.b = every.b[i]
     w.C = every.C[i]
-    w.g = every.g[i]
+    w.c = every.c[i]
+    w.slope = every.slope[i]
     return w

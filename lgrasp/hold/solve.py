@@ -12,16 +12,13 @@ from lgrasp.hold.energy import (
     relative_motion,
     twist_stiffness,
 )
-from lgrasp.hold.scratch import OBJECT_TERMS, Scratch
+from lgrasp.hold.scratch import Scratch
 from lgrasp.hold.system import (
-    GRADIENT,
     clear_row,
     contact_terms,
-    factor_block,
+    eliminate_finger,
     gather_shared,
     give_shared,
-    object_place,
-    reduce_column,
     reduce_object,
     set_row,
     solve_finger,
@@ -39,11 +36,24 @@ _SEARCH = wp.constant(10)  # points tried along a step
 
 
 @wp.func
+def _object_row(body: Body, a: wp.int32, dx: wp.spatial_vector):
+    """Row a of the object's own block, and its slope at motion dx."""
+    r = dx - body.free
+    way = wp.vec3()
+    way[a % 3] = 1.0
+    if a < 3:
+        own = wp.dot(wp.spatial_top(r), way) * body.mass - wp.dot(body.force, way)
+        return wp.spatial_vector(way * body.mass, wp.vec3()), own
+    by_turn = body.inertia * way
+    return wp.spatial_vector(wp.vec3(), by_turn), wp.dot(by_turn, wp.spatial_bottom(r))
+
+
+@wp.func
 def _assemble(hand: Hand, m: Material, body: Body, count: wp.int32, dx: wp.spatial_vector, w: Scratch):
     """Write the system at the motion so far, and its gradient by the joints to ``step``."""
     for c in range(w.lane, count, w.lanes):
         group = hand.body_group[w.contacts[c].body]
-        w.terms[c] = contact_terms(m, body.com, w.contacts[c], group, w.Y[c], c * OBJECT_TERMS, w.on_object)
+        w.terms[c] = contact_terms(m, body.com, w.contacts[c], group, w.Y[c], c * 6, w.object_rows, w.object_slope)
     meet()
     end = hand.kin.dof_first[hand.kin.groups]
     for k in range(w.lane, end, w.lanes):
@@ -57,23 +67,14 @@ def _assemble(hand: Hand, m: Material, body: Body, count: wp.int32, dx: wp.spati
         set_row(hand, count, group, k - hand.kin.dof_first[group], stiff + drag, slope, w)
     for k in range(end + w.lane, end + hand.kin.shared, w.lanes):
         clear_row(k, w)
-    for e in range(w.lane, OBJECT_TERMS, w.lanes):
-        s = float(0.0)
+    for a in range(w.lane, 6, w.lanes):
+        row, slope = _object_row(body, a, dx)
         for c in range(count):
-            s += w.on_object[c * OBJECT_TERMS + e]
-        w.C[e] = s
-    meet()
-    if w.lane == 0:
-        r = dx - body.free
-        by_turn = body.inertia * wp.spatial_bottom(r)
-        for a in range(3):
-            w.C[object_place(a, a)] += body.mass
-            w.C[GRADIENT + a] += body.mass * r[a] - body.force[a]
-            w.C[GRADIENT + 3 + a] += by_turn[a]
-            for b in range(a + 1):
-                w.C[object_place(3 + a, 3 + b)] += body.inertia[a, b]
-        for a in range(6):
-            w.g[a] = w.C[GRADIENT + a]
+            row += w.object_rows[c * 6 + a]
+            slope += w.object_slope[c * 6 + a]
+        w.C[a] = row
+        w.c[a] = slope
+        w.slope[a] = slope
     meet()
 
 
@@ -86,37 +87,29 @@ def _solve(hand: Hand, w: Scratch):
     shared = hand.kin.shared
     for group in range(w.lane, groups, w.lanes):
         first = hand.kin.dof_first[group]
-        factor_block(first, hand.kin.dof_free[group], hand.kin.dof_first[group + 1] - first, w.A)
-    meet()
-    for i in range(w.lane, groups * 7, w.lanes):
-        group = i // 7
-        first = hand.kin.dof_first[group]
         members = hand.kin.dof_first[group + 1] - first
-        reduce_column(first, hand.kin.dof_free[group], members, i % 7, w.A, w.B)
+        eliminate_finger(first, hand.kin.dof_free[group], members, w.A, w.B, w.b)
     meet()
     if shared > 0:
         if w.lane == 0:
             for group in range(groups):
                 gather_shared(hand, group, w)
-            factor_block(dofs, shared, shared, w.A)
-        meet()
-        for col in range(w.lane, 7, w.lanes):
-            reduce_column(dofs, shared, shared, col, w.A, w.B)
+            eliminate_finger(dofs, shared, shared, w.A, w.B, w.b)
         meet()
     reduce_object(hand, w)
     meet()
-    move = solve_object(w.C)
+    move = solve_object(w)
     slope = float(0.0)
     if w.lane == 0:
         for a in range(6):
-            slope += w.g[a] * move[a]
-        slope += solve_finger(dofs, shared, shared, move, w.A, w.B, w.step)
+            slope += w.slope[a] * move[a]
+        slope += solve_finger(dofs, shared, shared, move, w.A, w.B, w.b, w.step)
     meet()
     for group in range(w.lane, groups, w.lanes):
         first = hand.kin.dof_first[group]
         give_shared(hand, group, w)
         members = hand.kin.dof_first[group + 1] - first
-        slope += solve_finger(first, hand.kin.dof_free[group], members, move, w.A, w.B, w.step)
+        slope += solve_finger(first, hand.kin.dof_free[group], members, move, w.A, w.B, w.b, w.step)
     meet()
     return move, lanes_sum(slope)
 

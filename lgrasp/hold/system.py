@@ -1,25 +1,22 @@
 """The linear system of a Newton step: fingers couple through the object and through the joints that they share only,
 so each finger's own joints are eliminated by themselves, then the shared ones.
 
-Flat arrays: A (dofs, MAX_DOFS) lower triangles of the fingers' blocks, then their Cholesky factors; B (dofs, 7) the
-blocks between a finger and the object, and the gradient. The rows after those of the fingers are the shared joints'; a
-finger's block has a copy of each that moves it, after its own joints. C is the object's part: a lower triangle of
-6 x 6, then its gradient.
+A has lower triangles of the fingers' blocks, then their Cholesky factors, MAX_DOFS numbers a row; B the rows between a
+finger and the object; b the gradient. The rows after those of the fingers are the shared joints'; a finger's block has
+a copy of each that moves it, after its own joints. C and c are the object's block and gradient.
 """
 
 import warp as wp
 
 from lgrasp.hand.arrays import Hand
 from lgrasp.hold.energy import Material, friction_stiffness, twist_stiffness
-from lgrasp.hold.scratch import OBJECT_TERMS, Contact, Scratch, Terms
+from lgrasp.hold.scratch import Contact, Scratch, Terms
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.math.limits import MAX_DOFS
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-GRADIENT = OBJECT_TERMS - 6
-"""Place of the gradient in the object's part."""
 _LEAST = wp.constant(1.0e-9)  # of a pivot
 
 
@@ -31,10 +28,11 @@ def contact_terms(
     group: wp.int32,
     y: wp.vec4,
     at: wp.int32,
-    on_object: wp.array(dtype=wp.float32),
+    rows: wp.array(dtype=wp.spatial_vector),
+    slope: wp.array(dtype=wp.float32),
 ):
-    """Slope and curvature of a contact on a group at its motion y; what it adds to the object's part is written, from
-    ``at`` on."""
+    """Slope and curvature of a contact on a group at its motion y; what it adds to the object's rows and gradient is
+    written, from ``at`` on."""
     n = contact.normal
     s = wp.vec3(y[0], y[1], y[2])
     yn = wp.dot(n, s)
@@ -71,21 +69,13 @@ def contact_terms(
         RH = R * H
         K = RH * wp.transpose(R) + wp.outer(n, n) * own.turn_k
         rf = wp.cross(own.arm, own.f) + n * own.turn
+    H = own.H
     for a in range(3):
-        for b in range(a + 1):
-            on_object[at + object_place(a, b)] = own.H[a, b]
-            on_object[at + object_place(3 + a, 3 + b)] = K[a, b]
-        for b in range(3):
-            on_object[at + object_place(3 + a, b)] = RH[a, b]
-        on_object[at + GRADIENT + a] = -own.f[a]
-        on_object[at + GRADIENT + 3 + a] = -rf[a]
+        rows[at + a] = wp.spatial_vector(H[a, 0], H[a, 1], H[a, 2], RH[0, a], RH[1, a], RH[2, a])
+        rows[at + 3 + a] = wp.spatial_vector(RH[a, 0], RH[a, 1], RH[a, 2], K[a, 0], K[a, 1], K[a, 2])
+        slope[at + a] = -own.f[a]
+        slope[at + 3 + a] = -rf[a]
     return own
-
-
-@wp.func
-def object_place(a: wp.int32, b: wp.int32):
-    """Where entry (a, b) of the object's part is, b <= a."""
-    return a * (a + 1) // 2 + b
 
 
 @wp.func
@@ -111,11 +101,8 @@ def set_row(
     k = hand.kin.dof_first[group] + d
     for e in range(d + 1):
         w.A[k * MAX_DOFS + e] = row[e]
-    at = k * 7
-    for a in range(3):
-        w.B[at + a] = top[a]
-        w.B[at + 3 + a] = bottom[a]
-    w.B[at + 6] = slope
+    w.B[k] = wp.spatial_vector(top, bottom)
+    w.b[k] = slope
     w.step[k] = slope
 
 
@@ -124,72 +111,61 @@ def clear_row(k: wp.int32, w: Scratch):
     """Set a row of A and B and its gradient to zero."""
     for e in range(MAX_DOFS):
         w.A[k * MAX_DOFS + e] = 0.0
-    for e in range(7):
-        w.B[k * 7 + e] = 0.0
+    w.B[k] = wp.spatial_vector()
+    w.b[k] = 0.0
     w.step[k] = 0.0
 
 
 @wp.func
-def factor_block(first: wp.int32, free: wp.int32, dofs: wp.int32, A: wp.array(dtype=wp.float32)):
+def eliminate_finger(
+    first: wp.int32,
+    free: wp.int32,
+    dofs: wp.int32,
+    A: wp.array(dtype=wp.float32),
+    B: wp.array(dtype=wp.spatial_vector),
+    b: wp.array(dtype=wp.float32),
+):
     """Factor the ``free`` first rows of a block of ``dofs`` and take their part out of the others, which remain."""
     for d in range(dofs):
-        k = (first + d) * MAX_DOFS
+        k = first + d
         for e in range(d + 1):
-            s = A[k + e]
+            s = A[k * MAX_DOFS + e]
             for o in range(wp.min(e, free)):
-                s -= A[k + o] * A[(first + e) * MAX_DOFS + o]
+                s -= A[k * MAX_DOFS + o] * A[(first + e) * MAX_DOFS + o]
             if e == d and e < free:
                 s = wp.sqrt(wp.max(s, _LEAST))
             elif e < free:
                 s = s / A[(first + e) * MAX_DOFS + e]
-            A[k + e] = s
-
-
-@wp.func
-def reduce_column(
-    first: wp.int32,
-    free: wp.int32,
-    dofs: wp.int32,
-    col: wp.int32,
-    A: wp.array(dtype=wp.float32),
-    B: wp.array(dtype=wp.float32),
-):
-    """The same to a column of B, once the block is factored."""
-    for d in range(dofs):
-        k = first + d
-        s = B[k * 7 + col]
+            A[k * MAX_DOFS + e] = s
+        row = B[k]
+        slope = b[k]
         for o in range(wp.min(d, free)):
-            s -= A[k * MAX_DOFS + o] * B[(first + o) * 7 + col]
+            row -= B[first + o] * A[k * MAX_DOFS + o]
+            slope -= b[first + o] * A[k * MAX_DOFS + o]
         if d < free:
-            s = s / A[k * MAX_DOFS + d]
-        B[k * 7 + col] = s
-
-
-@wp.func
-def _freed(first: wp.int32, free: wp.int32, a: wp.int32, b: wp.int32, B: wp.array(dtype=wp.float32)):
-    """What the free rows of a block take out of entry (a, b) of the object's part; b = 6: out of its gradient."""
-    s = float(0.0)
-    for k in range(first, first + free):
-        s += B[k * 7 + a] * B[k * 7 + b]
-    return s
+            row = row / A[k * MAX_DOFS + d]
+            slope = slope / A[k * MAX_DOFS + d]
+        B[k] = row
+        b[k] = slope
 
 
 @wp.func
 def reduce_object(hand: Hand, w: Scratch):
     """Take the part of all joints out of the object's."""
-    dofs = hand.kin.dof_first[hand.kin.groups]
-    for e in range(w.lane, OBJECT_TERMS, w.lanes):
-        a = e - GRADIENT
-        b = int(6)
-        if e < GRADIENT:
-            a = int(0)
-            while object_place(a + 1, 0) <= e:
-                a += 1
-            b = e - object_place(a, 0)
-        s = w.C[e]
-        for group in range(hand.kin.groups):
-            s -= _freed(hand.kin.dof_first[group], hand.kin.dof_free[group], a, b, w.B)
-        w.C[e] = s - _freed(dofs, hand.kin.shared, a, b, w.B)
+    for a in range(w.lane, 6, w.lanes):
+        row = w.C[a]
+        slope = w.c[a]
+        for group in range(hand.kin.groups + 1):
+            first = hand.kin.dof_first[group]
+            end = first + hand.kin.shared
+            if group < hand.kin.groups:
+                end = first + hand.kin.dof_free[group]
+            for k in range(first, end):
+                own = w.B[k]
+                row -= own * own[a]
+                slope -= w.b[k] * own[a]
+        w.C[a] = row
+        w.c[a] = slope
 
 
 @wp.func
@@ -199,16 +175,16 @@ def gather_shared(hand: Hand, group: wp.int32, w: Scratch):
     end = hand.kin.dof_first[hand.kin.groups]
     for k in range(first + hand.kin.dof_free[group], hand.kin.dof_first[group + 1]):
         at = end + hand.kin.dof_shared[k]
-        w.step[at] += w.step[k]
-        for col in range(7):
-            w.B[at * 7 + col] += w.B[k * 7 + col]
+        w.step[at] = w.step[at] + w.step[k]
+        w.B[at] = w.B[at] + w.B[k]
+        w.b[at] = w.b[at] + w.b[k]
         for o in range(first + hand.kin.dof_free[group], k + 1):
             other = hand.kin.dof_shared[o]
             value = w.A[k * MAX_DOFS + o - first]
-            if other <= at - end:
-                w.A[at * MAX_DOFS + other] += value
-            else:
-                w.A[(end + other) * MAX_DOFS + at - end] += value
+            place = at * MAX_DOFS + other
+            if other > at - end:
+                place = (end + other) * MAX_DOFS + at - end
+            w.A[place] = w.A[place] + value
 
 
 @wp.func
@@ -219,20 +195,21 @@ def give_shared(hand: Hand, group: wp.int32, w: Scratch):
 
 
 @wp.func
-def solve_object(own: wp.array(dtype=wp.float32)):
-    """x of C x = -g by Cholesky, of the object's part, by every lane for itself."""
+def solve_object(w: Scratch):
+    """x of C x = -c by Cholesky, by every lane for itself."""
     C = wp.spatial_matrix()
     x = wp.spatial_vector()
     for a in range(6):
+        row = w.C[a]
         for b in range(a + 1):
-            s = own[object_place(a, b)]
+            s = row[b]
             for o in range(b):
                 s -= C[a, o] * C[b, o]
             if a == b:
                 C[a, a] = wp.sqrt(wp.max(s, _LEAST))
             else:
                 C[a, b] = s / C[b, b]
-        s = -own[GRADIENT + a]
+        s = -w.c[a]
         for o in range(a):
             s -= C[a, o] * x[o]
         x[a] = s / C[a, a]
@@ -252,7 +229,8 @@ def solve_finger(
     dofs: wp.int32,
     x: wp.spatial_vector,
     A: wp.array(dtype=wp.float32),
-    B: wp.array(dtype=wp.float32),
+    B: wp.array(dtype=wp.spatial_vector),
+    b: wp.array(dtype=wp.float32),
     step: wp.array(dtype=wp.float32),
 ):
     """Replace the gradient in ``step`` by the step of the ``free`` first joints of a block, once the object moves by x
@@ -261,9 +239,7 @@ def solve_finger(
     for back in range(free):
         d = free - 1 - back
         k = first + d
-        s = -B[k * 7 + 6]
-        for a in range(6):
-            s -= B[k * 7 + a] * x[a]
+        s = -b[k] - wp.dot(B[k], x)
         for o in range(d + 1, dofs):
             s -= A[(first + o) * MAX_DOFS + d] * step[first + o]
         s = s / A[k * MAX_DOFS + d]
