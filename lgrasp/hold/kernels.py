@@ -9,12 +9,13 @@ from lgrasp.hold.scratch import MAX_HAND_DOFS, Contact, Scratch, Scratches, scra
 from lgrasp.hold.solve import solve_step
 from lgrasp.math.constants import SLIDING_ARM
 from lgrasp.math.kinematics import group_forward, vec_dof
-from lgrasp.math.lanes import lanes_least, lanes_max, meet
+from lgrasp.math.lanes import LANES, lanes_least, lanes_max, meet
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
+BLOCKS = (LANES, 16)  # threads of a block, and blocks at a time: few registers each, as trials wait for memory
 _REACH = wp.constant(2.0e-3)  # [m] contacts are looked for within
 DRAWN_NUMBERS = wp.constant(12)
 """That a trial has, of the ranges of :class:`Spread` in turn, three each of ``shift`` and ``turn``."""
@@ -283,7 +284,7 @@ def _next(queue: wp.array(dtype=wp.int32), w: Scratch):
     return lanes_least(number)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=BLOCKS)
 def close_hands(
     hand: Hand,
     obj: Object,
@@ -340,7 +341,7 @@ def close_hands(
         i = _next(workers.queue, w)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=BLOCKS)
 def pull_objects(
     hand: Hand,
     obj: Object,

@@ -10,7 +10,7 @@ from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.hand.palm import palm_axis
 from lgrasp.math.lanes import LANES
 from lgrasp.refine.descent_kernels import Moments, Parts, Schedule, advance, descend, penetration
-from lgrasp.refine.energy_gradient import MAX_COLUMNS, Scratches, Search
+from lgrasp.refine.energy_gradient import MAX_COLUMNS, DescentScratches, Search
 from lgrasp.refine.hands import Hands
 from lgrasp.refine.match_kernels import (
     DEEPEST,
@@ -194,15 +194,15 @@ class Descent:
         dim = (scratch.X.shape[0], scratch.lanes)
         wp.launch(descend, dim=dim, inputs=inputs, outputs=[at.pose, at.q], device=self.device, block_dim=LANES)
 
-    def _scratch(self, rows: int) -> "Scratches":
+    def _scratch(self, rows: int) -> "DescentScratches":
         """For as many hands as are moved at a time."""
         lanes, most = (1, 1) if self.device == "cpu" else (LANES, _WORKERS)
         parts = self._points.body.shape[0] + self.params.contacts + self._solids.body.shape[0]
         wide = dict.fromkeys(("X", "F", "M"), self._bodies) | {"by_joint": self._bodies, "moved": 6}
         wide |= dict.fromkeys(("part_body", "part_force", "part_moment"), parts) | {"by_q": self._hand.model.dofs}
-        kinds = {name: Scratches.vars[name].type.dtype for name in wide}
+        kinds = {name: DescentScratches.vars[name].type.dtype for name in wide}
         made = {n: wp.empty((min(rows, most), wide[n]), dtype=kinds[n], device=self.device) for n in wide}
-        return make_struct(Scratches, lanes=lanes, **made)
+        return make_struct(DescentScratches, lanes=lanes, **made)
 
 
 def _middle(hand: HandArrays, surface: HandSurface) -> np.ndarray:

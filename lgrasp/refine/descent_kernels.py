@@ -6,8 +6,8 @@ from lgrasp.grasp.collision import plane_height
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
 from lgrasp.math.lanes import lanes_sum, meet
 from lgrasp.refine.energy_gradient import (
-    Scratch,
-    Scratches,
+    DescentScratch,
+    DescentScratches,
     Search,
     gather_parts,
     joint_pulls,
@@ -79,7 +79,7 @@ def _gradient(
     m: Correspondences,
     row: wp.int32,
     q: wp.array2d(dtype=wp.float32),
-    w: Scratch,
+    w: DescentScratch,
 ):
     """Write the derivatives of E* of a hand whose base is ``X[0]``: F and M of the base, and those by the joints."""
     for g in range(w.lane, h.groups, w.lanes):
@@ -106,7 +106,7 @@ def _step(
     row: wp.int32,
     k: wp.int32,
     q: wp.array2d(dtype=wp.float32),
-    w: Scratch,
+    w: DescentScratch,
 ):
     """Take step k of a hand down the derivatives."""
     centre = wp.transform_point(w.X[0], s.middle)
@@ -154,7 +154,7 @@ def descend(
     s: Search,
     m: Correspondences,
     schedule: Schedule,
-    scratch: Scratches,
+    scratch: DescentScratches,
     moments: Moments,
     pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),

@@ -27,7 +27,7 @@ _PARABOLA_CONSTANT = wp.constant(-2 * _LOG_STEEPEST - 4 * (STEEPEST - 1) / STEEP
 
 
 @wp.struct
-class Scratch:
+class DescentScratch:
     """What the lanes of a hand share."""
 
     lane: wp.int32
@@ -44,7 +44,7 @@ class Scratch:
 
 
 @wp.struct
-class Scratches:
+class DescentScratches:
     """The arrays of W hands."""
 
     lanes: wp.int32
@@ -60,9 +60,9 @@ class Scratches:
 
 
 @wp.func
-def scratch_of(every: Scratches, i: wp.int32, lane: wp.int32):
+def scratch_of(every: DescentScratches, i: wp.int32, lane: wp.int32):
     """Memory i, as a lane sees it."""
-    w = Scratch()
+    w = DescentScratch()
     w.lane = lane
     w.lanes = every.lanes
     w.X = every.X[i]
@@ -120,7 +120,7 @@ def _normal(plane: wp.vec4):
 
 
 @wp.func
-def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, w: Scratch):
+def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, w: DescentScratch):
     """Of the planes that points are drawn to and kept beyond: a part for each block."""
     for block in range(w.lane, points.body.shape[0], w.lanes):
         b = points.body[block]
@@ -151,7 +151,7 @@ def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, w:
 
 @wp.func
 def wrench_pulls(
-    points: Points, own: Volume, s: Search, m: Correspondences, row: wp.int32, first: wp.int32, w: Scratch
+    points: Points, own: Volume, s: Search, m: Correspondences, row: wp.int32, first: wp.int32, w: DescentScratch
 ):
     """Of the net wrench of the contacts: a part for each, from ``first`` on."""
     force = wp.vec3()
@@ -178,7 +178,7 @@ def wrench_pulls(
 
 
 @wp.func
-def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, first: wp.int32, w: Scratch):
+def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, first: wp.int32, w: DescentScratch):
     """Of the object's points that links are kept off: a part for each link, from ``first`` on."""
     each = m.deep.shape[1] // solids.body.shape[0]
     for link in range(w.lane, solids.body.shape[0], w.lanes):
@@ -199,7 +199,7 @@ def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, fi
 
 
 @wp.func
-def gather_parts(count: wp.int32, bodies: wp.int32, w: Scratch):
+def gather_parts(count: wp.int32, bodies: wp.int32, w: DescentScratch):
     """Force and moment of every body by its parts."""
     for b in range(w.lane, bodies, w.lanes):
         f = wp.vec3()
@@ -213,7 +213,7 @@ def gather_parts(count: wp.int32, bodies: wp.int32, w: Scratch):
 
 
 @wp.func
-def link_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, w: Scratch):
+def link_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, w: DescentScratch):
     """Of other links' points that links are kept off, added to the bodies; few are near enough."""
     pairs = solids.pairs.shape[0]
     count = m.link_plane.shape[1]
@@ -246,7 +246,7 @@ def link_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, w: 
 
 
 @wp.func
-def joint_pulls(h: Kinematics, s: Search, q: wp.array2d(dtype=wp.float32), row: wp.int32, w: Scratch):
+def joint_pulls(h: Kinematics, s: Search, q: wp.array2d(dtype=wp.float32), row: wp.int32, w: DescentScratch):
     """Write the derivatives by the joints; F and M of a body become those of all that rides on it."""
     for group in range(w.lane, h.groups, w.lanes):
         first = h.joint_first[group]
