@@ -1,7 +1,6 @@
 """Many copies of one scene on one device, stepped together by MuJoCo Warp."""
 
 from copy import copy
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,6 @@ _DEEP_PER_OBJECT = 24  # pairs that penetrate, on average
 _CONSTRAINTS_PER_OBJECT = 256  # rows: four a contact, limits, couplings
 _BUFFER_WARNINGS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # buffers that may be full
 _MOST_ITERATIONS = 20  # of Newton's method: all worlds wait for the slowest
-_PAIRS_PER_THREAD_BLOCK = ((512, 4), (2048, 8), (1 << 30, 32))
 
 
 @wp.struct
@@ -195,13 +193,6 @@ class Placed(NamedTuple):
             one.opt.warn_overflow = 0  # :class:`Sighting` tells
         return placed
 
-    def spread(self, worlds: int) -> Any:
-        """The far one, for so many worlds: fewer pairs of pieces to a block of threads, which wait for each other."""
-        m = copy(self.far)
-        pairs = next(pairs for most, pairs in _PAIRS_PER_THREAD_BLOCK if worlds <= most)
-        m.block_dim = replace(m.block_dim, convex_ccd=pairs)
-        return m
-
 
 class Worlds:
     """W copies of one scene, stepped a chunk at a time; states are kept and taken up again on the device."""
@@ -210,7 +201,7 @@ class Worlds:
         mujoco_warp = import_mujoco_warp()
         self._lib: Any = mujoco_warp
         self._model, self._device, self.worlds = model, wp.get_device(device), worlds
-        m, self._m, self._near = placed.host, placed.spread(worlds), placed.near
+        m, self._m, self._near = placed
         with wp.ScopedDevice(self._device):
             per = {"nconmax": _CONTACTS_PER_OBJECT, "nccdmax": _DEEP_PER_OBJECT, "njmax": _CONSTRAINTS_PER_OBJECT}
             room = {name: number * len(model.object_body) for name, number in per.items()}
