@@ -14,7 +14,7 @@ from lgrasp.engine.shard import shard_context
 from lgrasp.field.arrays import upload_field
 from lgrasp.field.build import build_field
 from lgrasp.field.params import FieldParams
-from lgrasp.grasp.structs import State
+from lgrasp.grasp.structs import FURTHER, State
 from lgrasp.grasp.tables import CandidateTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.build import build_hand
@@ -68,13 +68,17 @@ def one_candidate(context, centre, q):
     shape = (1, model.groups, 1)
     posture = np.zeros((*shape, MAX_DOFS), np.float32)
     posture[0, 0, 0, :2] = q
+    outward = np.array([0.0, np.cos(START), np.sin(START)])  # where the link is a tangent, in the middle of its width
+    place = np.argmax(
+        context.object.model.contact_normals @ outward - np.abs(context.object.model.contact_points[:, 0])
+    )
     poses = {"index": [0], "palm_point": [-1], "palm_surface": [-1], "setting": [0], "resting": [-1]}
     arrays = {name: np.array(values, np.int32) for name, values in poses.items()}
     arrays |= {"pose": np.array([[0, *centre, 0, 0, 0, 1]], np.float32), "anchor": np.full(shape[:2], -1, np.int32)}
     arrays = {f"poses.{name}": values for name, values in arrays.items()}
-    arrays |= {"count": np.array([[1, 0]], np.int32), "surface": np.zeros(shape, np.int32), "q": posture}
+    arrays |= {"count": np.array([[1, 0]], np.int32), "surface": np.full(shape, place, np.int32), "q": posture}
     arrays |= {"record": np.full(shape, record, np.int32), "state": np.full(shape, int(State.REALISED), np.int32)}
-    return CandidateTable.of(arrays | {"further": np.zeros((0, 0, 0, 2), np.int32)}, context.device)
+    return CandidateTable.of(arrays | {"further": np.zeros((0, 0, 0, 4), np.int32)}, context.device)
 
 
 def test_two_links_become_tangents_of_a_cylinder(gripper):
@@ -157,9 +161,12 @@ def test_contacts_lie_on_links_of_their_finger(source, power, finger_posture, li
     for i in range(0, len(row), 5):
         main = gaps(i, arrays["surface"][row[i], group[i], slot[i]])
         assert main[int(first[i])] < bounds.max_gap + 1e-4
-        for place in arrays["further"][row[i], group[i], slot[i]]:
+        further = arrays["further"][row[i], group[i], slot[i]]
+        for place, point in zip(further[:FURTHER], further[FURTHER:], strict=True):
             if place >= 0:
-                assert min(d for k, d in gaps(i, place).items() if k != first[i]) < bounds.max_gap + 1e-4
+                link = source.hand.model.contact_link[point]
+                assert link != first[i]
+                assert gaps(i, place)[int(link)] < bounds.max_gap + 1e-4
 
 
 def test_batches_change_nothing(source, power):
