@@ -88,6 +88,13 @@ class GraspBounds(Params):
         le=ANY_CLOSING,
         description="Farthest that a joint moves from q_pregrasp to q [rad or m]; 10 asks for nothing.",
     )
+    min_pregrasp_opening: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="How far each touching finger opens for q_pregrasp at least, its joint that moves most [rad or m]; "
+        "0 asks for nothing.",
+    )
     min_table_distance: float = Field(
         default=0.001, ge=0, le=0.05, description="Least distance of the hand from the table, where there is one."
     )

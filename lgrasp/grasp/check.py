@@ -111,9 +111,9 @@ class Check:
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
         packed, on_table = self._pack(seed, row), self.obj.planes is not None
         self._share(row, tally)
-        least = (self.limits.min_squeeze_travel, self.limits.min_stable_squeeze, self.limits.min_epsilon)
-        bounded = max(least) > 0.0
-        bounded |= self.limits.max_closing_travel < ANY_CLOSING
+        limits = self.limits
+        least = (limits.min_squeeze_travel, limits.min_stable_squeeze, limits.min_epsilon, limits.min_pregrasp_opening)
+        bounded = max(least) > 0.0 or limits.max_closing_travel < ANY_CLOSING
         if bounded:
             wp.launch(drop_limp, len(self), [self.limits, packed], [row, tally.device], device=self.hand.device)
         if on_table:

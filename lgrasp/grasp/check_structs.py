@@ -35,6 +35,7 @@ class Limits:
     min_squeeze_travel: wp.float32
     min_stable_squeeze: wp.float32
     max_closing_travel: wp.float32
+    min_pregrasp_opening: wp.float32
     squeeze_margin: wp.float32
     deepest: wp.float32  # penetrations above this are not distinguished
     whole: wp.int32  # 1: rows that failed are measured to the end

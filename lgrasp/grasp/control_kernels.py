@@ -189,7 +189,8 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
 @wp.kernel
 def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)):
     """Rows that squeeze the object by less than ``min_squeeze_travel``, or cannot stably with ``min_stable_squeeze``,
-    or close by more than ``max_closing_travel``, or have less than ``min_epsilon``, become none.
+    or close by more than ``max_closing_travel``, or have less than ``min_epsilon``, or a finger that opens by less than
+    ``min_pregrasp_opening``, become none.
 
     Args:
         row_out: (m,) hand of each row, -1 none.
@@ -199,7 +200,9 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     if row_out[i] < 0:
         return
     limp = packed.squeeze_travel[i] < limits.min_squeeze_travel or packed.stable_squeeze[i] < limits.min_stable_squeeze
-    if limp or packed.closing_travel[i] > limits.max_closing_travel or packed.epsilon[i] < limits.min_epsilon:
+    still = packed.pregrasp_opening[i] < limits.min_pregrasp_opening
+    far = packed.closing_travel[i] > limits.max_closing_travel
+    if limp or still or far or packed.epsilon[i] < limits.min_epsilon:
         row_out[i] = -1
         wp.atomic_sub(counts_out, KEPT, 1)
         wp.atomic_add(counts_out, SQUEEZE, 1)

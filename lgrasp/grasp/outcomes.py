@@ -49,7 +49,7 @@ SHARED = (*REASONS, "touch")
 FAILED_BOUNDS = (
     *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
     *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel", "min_stable_squeeze"),
-    *("max_closing_travel", "min_epsilon"),
+    *("max_closing_travel", "min_epsilon", "min_pregrasp_opening"),
 )
 """By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
 way of the open hand to the object clears the table."""
@@ -74,7 +74,9 @@ METRICS = (
 """Columns of the metrics table."""
 
 
-_SQUEEZE_BOUNDS = ("min_squeeze_travel", "max_closing_travel", "min_stable_squeeze", "min_epsilon")
+_SQUEEZE_BOUNDS = (
+    *("min_squeeze_travel", "max_closing_travel", "min_stable_squeeze", "min_epsilon", "min_pregrasp_opening"),
+)
 
 
 def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
@@ -88,6 +90,7 @@ def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
         table.metrics["closing_travel"] > bounds.max_closing_travel,
         table.metrics["stable_squeeze"] < bounds.min_stable_squeeze,
         table.metrics["epsilon"] < bounds.min_epsilon,
+        table.metrics["pregrasp_opening"] < bounds.min_pregrasp_opening,
     ]
 
 

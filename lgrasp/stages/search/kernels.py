@@ -100,7 +100,7 @@ def _contacts(
 
 @wp.kernel
 def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
-    """Scores of hits go below 0 when they have too few contacts, or friction does not balance them."""
+    """Scores of hits go below 0 when friction does not balance them."""
     row, lane = _hit(hits, tried_out, wp.tid())
     if row < 0:
         return
@@ -108,9 +108,6 @@ def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Can
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     n = _contacts(obj, candidates, tried_out, row, lane, points, normals)
-    if n < params.min_contacts:
-        tried_out.score[row, lane] = -1.0
-        return
     centred(points, n, arms)
     if not balances(arms, normals, n, params.friction * INSCRIBED, params.torque_scale, params.max_gswo):
         tried_out.score[row, lane] = -1.0

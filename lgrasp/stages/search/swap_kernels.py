@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from lgrasp.grasp.structs import Candidates
+from lgrasp.grasp.structs import Candidates, further_contacts
 from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -18,9 +18,20 @@ from lgrasp.stages.search.sets import (
     put_contact,
     start_set,
     start_state,
+    vec_set,
 )
 
 wp.set_module_options(KERNEL_OPTIONS)
+
+
+@wp.func
+def _further(candidates: Candidates, row: wp.int32, chosen: vec_set):
+    """Contacts of other links that the chosen candidates bring along."""
+    n = int(0)
+    for g in range(candidates.count.shape[1]):
+        if chosen[g] >= 0:
+            n += further_contacts(candidates, row, g, chosen[g])
+    return n
 
 
 def _swapping(measure: Any) -> Any:
@@ -88,9 +99,12 @@ def _swapping(measure: Any) -> Any:
                 else:
                     points[i] = old_point
                     normals[i] = old_normal
-            if (score[0] < goal and score[1] >= params.least_force) or k >= most or r + 1 == params.rounds:
+            stable = score[0] < goal and score[1] >= params.least_force
+            if stable and n + _further(candidates, row, chosen) >= params.min_contacts:
                 break
-            # the set lacks stability: add a contact of an unused finger, and search that one
+            if k >= most or r + 1 == params.rounds:
+                break
+            # the set lacks stability, or contacts: add one of an unused finger, and search that one
             skip = wp.min(int(wp.randf(state) * float(available - k)), available - k - 1)
             added = int(-1)
             for g in range(G):
@@ -110,6 +124,8 @@ def _swapping(measure: Any) -> Any:
             n += 1
             score = measure(points, normals, n, params.friction, params.torque_scale)
         if score[0] >= goal or score[1] < params.least_force:
+            return
+        if n + _further(candidates, row, chosen) < params.min_contacts:
             return
         for g in range(G):
             tried_out.chosen[row, lane, g] = chosen[g]
