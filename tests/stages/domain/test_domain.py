@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import PoseTable
 from lgrasp.stages.domain.params import DomainParams
 from lgrasp.stages.domain.stage import run
@@ -65,3 +66,16 @@ def test_a_pose_gives_the_same_alone(context, tables):
         for g, n in enumerate(whole["count"][i]):
             np.testing.assert_array_equal(alone["surface"][0, g, :n], whole["surface"][i, g, :n])
             np.testing.assert_array_equal(alone["q"][0, g, :n], whole["q"][i, g, :n])
+
+
+def test_what_is_realised_is_kept_where_there_is_no_room_for_more(context, tables):
+    """Fewer contacts have room than are asked for: later rounds leave full fingers alone."""
+    params = DomainParams(keep=4, enough=12, rounds=2)
+    table = run(tables.place, params, context)[0]
+    table.state.fill_(int(State.REALISED))
+    before = table.arrays()
+    after = run(table, params, context.changed(round=1))[0].arrays()
+    full = before["count"] == params.keep
+    assert full.sum() > 10
+    assert after["count"].max() == params.keep
+    np.testing.assert_array_equal(after["record"][full], before["record"][full])

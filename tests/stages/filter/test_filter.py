@@ -191,7 +191,7 @@ def test_pregrasp_opening(finished, inputs):
     np.testing.assert_array_equal(grasps.metrics["force_closure"], grasps.metrics["epsilon"] > 0)
 
 
-@pytest.mark.parametrize("metric", ["squeeze_travel", "stable_squeeze", "epsilon"])
+@pytest.mark.parametrize("metric", ["squeeze_travel", "stable_squeeze", "epsilon", "pregrasp_opening"])
 def test_grasps_that_hardly_squeeze_are_dropped_where_asked(tables, context, swift, metric):
     params = swift.params("filter")
     free = run(tables.search, params, context)

@@ -24,6 +24,7 @@ from lgrasp.math.limits import MAX_DOFS
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
+from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 from lgrasp.stages.wrap.params import WrapParams
 from lgrasp.stages.wrap.stage import run
@@ -186,3 +187,14 @@ def test_what_ik_leaves_in_the_object_is_wrapped_or_blocked(source, power):
     wrapped = arrays["further"].max(3) >= 0
     assert (wrapped & left).sum() > 20
     np.testing.assert_array_equal(arrays["state"][left], np.where(wrapped[left], State.REALISED, State.BLOCKED))
+
+
+def test_contacts_that_search_counts_are_contacts_of_the_grasp(source, power):
+    """Sets have five contacts, further ones included; the filter finds all of them on the links' meshes."""
+    meter = Meter(source.hand.device)
+    grasps = run_stages(power, shard_context(power, source, 0), 0, 256, "filter", meter)
+    found = meter.counts["filter"]
+    assert found["kept"] == len(grasps) > 5
+    assert found["contact"] == 0
+    assert ((grasps.contact_links >= 0).sum(1) >= power.bounds.min_contacts).all()
+    assert grasps.metrics["pregrasp_opening"].min() >= power.bounds.min_pregrasp_opening > 0
