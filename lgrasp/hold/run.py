@@ -21,7 +21,7 @@ from lgrasp.hold.kernels import (
 )
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.scratch import MAX_HAND_DOFS, MAX_TOUCHES, Contact, empty_scratches
-from lgrasp.math.lanes import LANES
+from lgrasp.math.lanes import LANES, lanes_of
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.object.mass import mass_properties
 from lgrasp.runtime.fetch import fetch
@@ -154,7 +154,8 @@ class HoldTester:
         pulls = make_struct(TrialPulls, held=held, displacement=displacement)
         both = [self._hand.struct, self._object.struct, self._course]
         # on a GPU every worker pulls one way only
-        each, lanes, most = (ways, 1, 1) if device == "cpu" else (1, LANES, _WORKERS)
+        lanes = lanes_of(device)
+        each, most = (1, _WORKERS) if lanes > 1 else (ways, 1)
         runs = n * (ways // each)
         scratch = empty_scratches(min(runs, most), device)
         closing, pulling = (

@@ -10,6 +10,11 @@ LANES = 32
 """On a GPU."""
 
 
+def lanes_of(device: str) -> int:
+    """How many a device gives to one thing."""
+    return LANES if wp.get_device(device).is_cuda else 1
+
+
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 __syncwarp();

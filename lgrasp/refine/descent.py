@@ -8,7 +8,7 @@ from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.hand.palm import palm_axis
-from lgrasp.math.lanes import LANES
+from lgrasp.math.lanes import LANES, lanes_of
 from lgrasp.refine.descent_kernels import Moments, Parts, Schedule, advance, descend, penetration
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, DescentScratches, Search
 from lgrasp.refine.hands import Hands
@@ -170,7 +170,7 @@ class Descent:
         self._place(at, body)
         self._match_object(m, body, reach)
         near = max(p.contacts, int(p.nearest * points.palmar.shape[0]))
-        lanes = 1 if d == "cpu" else LANES
+        lanes = lanes_of(d)
         inputs = [points, near, p.contacts, lanes, body, m]
         wp.launch(choose_contacts, dim=(rows, lanes), inputs=inputs, device=d, block_dim=LANES)
         wp.launch(match_links, dim=(solids.pairs.shape[0], rows), inputs=[solids, p.margin, body, m], device=d)
@@ -196,7 +196,8 @@ class Descent:
 
     def _scratch(self, rows: int) -> "DescentScratches":
         """For as many hands as are moved at a time."""
-        lanes, most = (1, 1) if self.device == "cpu" else (LANES, _WORKERS)
+        lanes = lanes_of(self.device)
+        most = _WORKERS if lanes > 1 else 1
         parts = self._points.body.shape[0] + self.params.contacts + self._solids.body.shape[0]
         wide = dict.fromkeys(("X", "F", "M"), self._bodies) | {"by_joint": self._bodies, "moved": 6}
         wide |= dict.fromkeys(("part_body", "part_force", "part_moment"), parts) | {"by_q": self._hand.model.dofs}

@@ -48,15 +48,15 @@ class DescentScratches:
     """The arrays of W hands."""
 
     lanes: wp.int32
-    X: wp.array2d(dtype=wp.transform)
-    F: wp.array2d(dtype=wp.vec3)
-    M: wp.array2d(dtype=wp.vec3)
-    part_body: wp.array2d(dtype=wp.int32)
-    part_force: wp.array2d(dtype=wp.vec3)
-    part_moment: wp.array2d(dtype=wp.vec3)
-    by_joint: wp.array2d(dtype=wp.float32)
-    by_q: wp.array2d(dtype=wp.float32)
-    moved: wp.array2d(dtype=wp.float32)
+    X: wp.array2d(dtype=wp.transform)  # (W, B)
+    F: wp.array2d(dtype=wp.vec3)  # (W, B)
+    M: wp.array2d(dtype=wp.vec3)  # (W, B)
+    part_body: wp.array2d(dtype=wp.int32)  # (W, parts)
+    part_force: wp.array2d(dtype=wp.vec3)  # (W, parts)
+    part_moment: wp.array2d(dtype=wp.vec3)  # (W, parts)
+    by_joint: wp.array2d(dtype=wp.float32)  # (W, J)
+    by_q: wp.array2d(dtype=wp.float32)  # (W, K)
+    moved: wp.array2d(dtype=wp.float32)  # (W, 6)
 
 
 @wp.func

@@ -3,6 +3,7 @@
 import numpy as np
 
 from lgrasp.grasp.predicted import TouchingGrasps, record_of_points
+from lgrasp.grasp.structs import FURTHER
 from lgrasp.grasp.tables import ContactSets
 from lgrasp.stages.context import Context
 
@@ -45,7 +46,7 @@ def touching_sets(grasps: TouchingGrasps, context: Context) -> ContactSets:
         "candidates.record": record[kept],
         "candidates.state": np.ones_like(surface[kept]),
         "candidates.q": posture[kept],
-        "candidates.further": np.zeros((len(kept), groups, 1, 0), np.int32),
+        "candidates.further": np.zeros((len(kept), groups, 0, 2 * int(FURTHER)), np.int32),
         "candidates.poses.index": (kept * held.struct.tries).astype(np.int32),
         "candidates.poses.pose": grasps.pose[kept].astype(np.float32),
         "candidates.poses.palm_point": palm_point[kept],

@@ -73,7 +73,8 @@ def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, draws):
     (tried, plans), (untried, first), (alone, _) = shares(12), shares(0), shares(1)
     assert tried.keys() == untried.keys()
     assert all(tried[start] >= share for start, share in untried.items())
-    assert sum(tried.values()) > sum(untried.values())
+    if draws:  # else a hand holds or not, and it may be that no better one is among twelve
+        assert sum(tried.values()) > sum(untried.values())
     assert alone == untried  # one hand of each start is the best, however often it holds
     always = [untried[start] == 1 for start in first.index.tolist()]  # where the best always holds, it is the plan
     np.testing.assert_array_equal(plans.q[always], first.q[always])

@@ -73,7 +73,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
     room = empty_struct(TriedSets, d, n, min(params.restarts, max(lanes, _MOST_STARTS)) if paced else lanes, groups)
     first = 0
-    while first < params.restarts:
+    while n and first < params.restarts:
         lanes = min(max(lanes, min(first // 2, _MOST_STARTS if paced else 0)), params.restarts - first)
         tried = make_struct(TriedSets, room, score=room.score[:, :lanes])
         values.per_pose = params.per_pose - (params.taper * params.per_pose * first) // params.restarts
