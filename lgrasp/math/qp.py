@@ -330,12 +330,17 @@ def by_difficulty(normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, ra
 
 
 @wp.func
+def _centroid(points: vec3s, k: wp.int32):
+    c = wp.vec3(0.0)
+    for i in range(k):
+        c = c + points[i]
+    return c / float(k)
+
+
+@wp.func
 def _frictionless_few(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.float32):
     """:func:`frictionless` of at most _FEW contacts: the same with loops of known length."""
-    centroid = wp.vec3(0.0)
-    for i in range(k):
-        centroid = centroid + points[i]
-    centroid = centroid / float(k)
+    centroid = _centroid(points, k)
     N = mat_few3()
     W = mat_few3()
     G = mat_few()
@@ -408,10 +413,7 @@ def frictionless(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.fl
     """
     if k <= _FEW:
         return _frictionless_few(points, normals, k, torque_scale)
-    centroid = wp.vec3(0.0)
-    for i in range(k):
-        centroid = centroid + points[i]
-    centroid = centroid / float(k)
+    centroid = _centroid(points, k)
     G = mat_gram()
     W = mat63()
     trace = float(0.0)
