@@ -65,7 +65,7 @@ def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, draws):
 
     def shares(tried):
         params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": tried, "hold": test} | alike)
-        table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(24).grasps  # of few none may differ
+        table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(60).grasps  # of fewer none may differ
         found = HoldTester(inputs.hand, inputs.object, test).run(ControlPoses.of(table), 0)
         share = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
         return dict(zip(table.index.tolist(), share.tolist(), strict=True)), table
@@ -73,8 +73,7 @@ def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, draws):
     (tried, plans), (untried, first), (alone, _) = shares(12), shares(0), shares(1)
     assert tried.keys() == untried.keys()
     assert all(tried[start] >= share for start, share in untried.items())
-    if draws:  # else a hand holds or not, and it may be that no better one is among twelve
-        assert sum(tried.values()) > sum(untried.values())
+    assert sum(tried.values()) > sum(untried.values())
     assert alone == untried  # one hand of each start is the best, however often it holds
     always = [untried[start] == 1 for start in first.index.tolist()]  # where the best always holds, it is the plan
     np.testing.assert_array_equal(plans.q[always], first.q[always])
