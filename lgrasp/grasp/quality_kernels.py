@@ -6,7 +6,7 @@ from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed
 from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION, TOUCH
 from lgrasp.math.constants import BALANCED, CONE_EDGES
 from lgrasp.math.limits import MAX_CONTACTS
-from lgrasp.math.qp import balance, unresisted
+from lgrasp.math.qp import balance, centroid, unresisted
 from lgrasp.math.quality import epsilon_bound
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
@@ -42,12 +42,10 @@ def _balanced(
     forces: vec3s,
 ):
     """:func:`balance` about the contacts' centroid."""
-    centroid = wp.vec3(0.0)
-    for c in range(k):
-        centroid = centroid + points[c]
+    middle = centroid(points, k)
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     for c in range(k):
-        arms[c] = points[c] - centroid / float(k)
+        arms[c] = points[c] - middle
     return balance(arms, normals, k, friction, edges, torque_scale, stop, forces)
 
 

@@ -330,7 +330,8 @@ def by_difficulty(normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, ra
 
 
 @wp.func
-def _centroid(points: vec3s, k: wp.int32):
+def centroid(points: vec3s, k: wp.int32):
+    """Mean of the first k points."""
     c = wp.vec3(0.0)
     for i in range(k):
         c = c + points[i]
@@ -340,7 +341,7 @@ def _centroid(points: vec3s, k: wp.int32):
 @wp.func
 def _frictionless_few(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.float32):
     """:func:`frictionless` of at most _FEW contacts: the same with loops of known length."""
-    centroid = _centroid(points, k)
+    middle = centroid(points, k)
     N = mat_few3()
     W = mat_few3()
     G = mat_few()
@@ -350,7 +351,7 @@ def _frictionless_few(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: 
         if wp.static(i) < k:
             active[i] = 1.0
             N[i] = normals[i]
-            W[i] = wp.cross(points[i] - centroid, normals[i]) * torque_scale
+            W[i] = wp.cross(points[i] - middle, normals[i]) * torque_scale
         for j in range(wp.static(i + 1)):
             G[i, wp.static(j)] = wp.dot(N[i], N[j]) + wp.dot(W[i], W[j])
         trace += G[i, i]
@@ -413,12 +414,12 @@ def frictionless(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.fl
     """
     if k <= _FEW:
         return _frictionless_few(points, normals, k, torque_scale)
-    centroid = _centroid(points, k)
+    middle = centroid(points, k)
     G = mat_gram()
     W = mat63()
     trace = float(0.0)
     for i in range(k):
-        t = wp.cross(points[i] - centroid, normals[i]) * torque_scale
+        t = wp.cross(points[i] - middle, normals[i]) * torque_scale
         W[i] = t
         for j in range(i + 1):
             g = wp.dot(normals[i], normals[j]) + wp.dot(t, W[j])

@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.grasp.structs import Candidates
 from lgrasp.math.constants import INSCRIBED
 from lgrasp.math.limits import MAX_CONTACTS, MAX_GROUPS
-from lgrasp.math.qp import balance, frictionless
+from lgrasp.math.qp import balance, centroid, frictionless
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -82,11 +82,9 @@ class FoundSets:
 @wp.func
 def centred(points: vec3s, k: wp.int32, arms: vec3s):
     """Arms of contact points about their centroid."""
-    centroid = wp.vec3(0.0)
+    middle = centroid(points, k)
     for i in range(k):
-        centroid = centroid + points[i]
-    for i in range(k):
-        arms[i] = points[i] - centroid / float(k)
+        arms[i] = points[i] - middle
     return k
 
 
