@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.unrolled import unrolled
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -16,6 +17,7 @@ def solving(size: int) -> Any:
     """
     square, column = wp.types.matrix((size, size), wp.float32), wp.types.vector(size, wp.float32)
 
+    @unrolled
     @wp.func
     def solve(A: square, b: column, n: wp.int32, shift: wp.float32, floor: wp.float32):
         L = square()

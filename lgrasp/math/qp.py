@@ -11,6 +11,7 @@ from lgrasp.math.constants import LOAD_ARM, LOAD_FORCE
 from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.math.transforms import tangent, vec3s
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.unrolled import unrolled
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -338,6 +339,7 @@ def centroid(points: vec3s, k: wp.int32):
     return c / float(k)
 
 
+@unrolled
 @wp.func
 def _frictionless_few(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.float32):
     """:func:`frictionless` of at most _FEW contacts: the same with loops of known length."""

@@ -17,6 +17,7 @@ from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
 from lgrasp.math.sdf import sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.unrolled import unrolled
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -55,6 +56,7 @@ def _realising(size: int) -> Any:
     """The kernel for groups of at most ``size`` dofs: what is known to the compiler stays in registers."""
     square, column, solve = wp.types.matrix((size, size), wp.float32), wp.types.vector(size, wp.float32), solving(size)
 
+    @unrolled
     @wp.kernel
     def realise_contacts(
         hand: Hand,
