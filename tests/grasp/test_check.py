@@ -13,7 +13,9 @@ from lgrasp.engine.shard import shard_context
 from lgrasp.field.params import FieldParams
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
+from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.outcomes import METRICS, REASONS, Outcome
+from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.find import find_hand
 from lgrasp.runtime.device import resolve_device
 from lgrasp.stages.context import Context
@@ -56,36 +58,43 @@ def hand_inputs(hand, cache_root) -> Inputs:
     return load_inputs(Cache(cache_root, pytest.fail), keys, 1.0, pipeline.object, field, resolve_device("cpu"))
 
 
+@pytest.fixture(scope="module")
+def robust(hand_inputs) -> tuple[Context, GraspTable]:
+    """Rows of the first candidates of the default pipeline."""
+    context = replace(shard_context(ROBUST, hand_inputs, 0), field=replace(hand_inputs.field, boxes=None))
+    return context, run_stages(ROBUST, context, 0, PIPELINES["robust"], "filter")
+
+
 def rechecked(context: Context, table, bounds: GraspBounds):
     contacts = known_contacts(table.contact_links, table.contact_points, table.contact_normals, "cpu")
     return check_grasps(context.hand, context.object, table.pose, table.q, contacts, bounds)
 
 
-def test_slices_of_bodies_give_the_same_rows(hand, hand_inputs, monkeypatch):
+def test_slices_of_bodies_give_the_same_rows(hand, robust, monkeypatch):
     """A GPU looks at the points of a body in several slices."""
-    context = replace(shard_context(ROBUST, hand_inputs, 0), field=replace(hand_inputs.field, boxes=None))
-
-    def made(slices):
-        for module in ("lgrasp.grasp.check", "lgrasp.stages.search.stage"):
-            monkeypatch.setattr(f"{module}.depth_slices", lambda device: slices)
-        return run_stages(ROBUST, context, 0, PIPELINES["robust"], "filter")
-
-    whole, sliced = made(1), made(8)
+    context, whole = robust
+    assert depth_slices("cpu") == 1
+    for module in ("lgrasp.grasp.check", "lgrasp.stages.search.stage"):
+        monkeypatch.setattr(f"{module}.depth_slices", lambda device: 8)
+    sliced = run_stages(ROBUST, context, 0, PIPELINES["robust"], "filter")
     assert len(whole) > 0 or (hand, "robust") in FEW
     np.testing.assert_array_equal(sliced.q, whole.q)
     np.testing.assert_array_equal(sliced.metrics["penetration"], whole.metrics["penetration"])
 
 
 @pytest.mark.parametrize("name", PIPELINES)
-def test_every_row_of_a_pipeline_passes(hand, name, hand_inputs):
+def test_every_row_of_a_pipeline_passes(hand, name, hand_inputs, robust):
     pipeline = load_pipeline(name)
     if (hand, name) not in MORE:
         pipeline = pipeline.with_settings(SMALLER.get(name, ()))
-    context = shard_context(pipeline, hand_inputs, 0)
-    if pipeline.field.index == "voxel":
-        context = replace(context, field=replace(context.field, boxes=None))
-    count = MORE.get((hand, name), PIPELINES[name])
-    table = run_stages(pipeline, context, 0, count, pipeline.order[-1])
+    if name == "robust":
+        context, table = robust
+    else:
+        context = shard_context(pipeline, hand_inputs, 0)
+        if pipeline.field.index == "voxel":
+            context = replace(context, field=replace(context.field, boxes=None))
+        count = MORE.get((hand, name), PIPELINES[name])
+        table = run_stages(pipeline, context, 0, count, pipeline.order[-1])
     assert len(table) > 0 or (hand, name) in FEW
     again, outcome = rechecked(context, table, pipeline.bounds)
     assert [REASONS[k] for k in outcome[outcome != Outcome.KEPT]] == []

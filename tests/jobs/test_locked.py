@@ -5,6 +5,7 @@ import numpy as np
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.field.params import FieldParams
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.judge.run import judge
@@ -12,10 +13,9 @@ from lgrasp.judge.run import judge
 
 def test_locked_joints_are_in_the_shard(cache_root, tmp_path):
     name = "shadow"
-    pipeline = load_pipeline("swift")
-    pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 20_000})})
+    pipeline = load_pipeline("swift").model_copy(update={"field": FieldParams(records=20_000, index="bvh")})
     given = {"pipeline": pipeline, "out": tmp_path / "out", "cache": Cache(cache_root)}
-    outcome = generate(GenerateJob(hand=name, object="sphere", rows=60, **given))
+    outcome = generate(GenerateJob(hand=name, object="sphere", rows=30, **given))
     shard = read_shard(outcome.paths[0])
     names = list(shard.hand.joint_names)
     locked = find_hand(name).spec.locked

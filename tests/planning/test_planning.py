@@ -1,11 +1,15 @@
 """Plans: the best hand of each start."""
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 import pytest
 
 from lgrasp.cloud.model import cloud_object
 from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.outcomes import REASONS, Outcome
+from lgrasp.grasp.tables import GraspTable
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.planning.params import PlanParams
@@ -58,19 +62,31 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
     np.testing.assert_array_equal(few.grasps.pose, planned.grasps.pose[same])
 
 
+@pytest.fixture(scope="module")
+def plan(inputs) -> Callable[..., GraspTable]:
+    """plan(tried, draws): plans of 60 starts, of fewer none may differ."""
+
+    @cache
+    def plan(tried: int, draws: int = 0) -> GraspTable:
+        several = {"rolls": 12, "finalists": 12, "tried": tried, "hold": HoldTest(draws=draws)}
+        alike = {"rank_friction": QUICK.bounds.friction}  # hands are tried as they will be plans
+        params = QUICK.model_copy(update=several | alike)
+        return Planner(inputs.hand, inputs.object.model, 0.12, params).run(60).grasps
+
+    return plan
+
+
 @pytest.mark.parametrize("draws", [0, 4])
-def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, draws):
-    test = HoldTest(draws=draws)
-    alike = {"rank_friction": QUICK.bounds.friction}  # hands are tried as they will be plans
+def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, plan, draws):
+    tester = HoldTester(inputs.hand, inputs.object, HoldTest(draws=draws))
 
-    def shares(tried):
-        params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": tried, "hold": test} | alike)
-        table = Planner(inputs.hand, inputs.object.model, 0.12, params).run(60).grasps  # of fewer none may differ
-        found = HoldTester(inputs.hand, inputs.object, test).run(ControlPoses.of(table), 0)
+    def shares(table):
+        found = tester.run(ControlPoses.of(table), 0)
         share = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
-        return dict(zip(table.index.tolist(), share.tolist(), strict=True)), table
+        return dict(zip(table.index.tolist(), share.tolist(), strict=True))
 
-    (tried, plans), (untried, first), (alone, _) = shares(12), shares(0), shares(1)
+    plans, first = plan(12, draws), plan(0)  # without a try, draws say nothing
+    tried, untried, alone = shares(plans), shares(first), shares(plan(1, draws))
     assert tried.keys() == untried.keys()
     assert all(tried[start] >= share for start, share in untried.items())
     assert sum(tried.values()) > sum(untried.values())
