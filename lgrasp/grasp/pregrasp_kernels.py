@@ -49,14 +49,21 @@ def finger_clear(
 
 
 @wp.func
+def joint_motion(hand: Hand, g: wp.int32, x: vec_dof, q: vec_dof):
+    """Largest motion of a finger's joints from q to x [rad or m]."""
+    moved = float(0.0)
+    for d in range(hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]):
+        moved = wp.max(moved, wp.abs(x[d] - q[d]))
+    return moved
+
+
+@wp.func
 def put_pregrasp(hand: Hand, g: wp.int32, x: vec_dof, q: vec_dof, i: wp.int32, packed_out: Packed):
     """Store how a finger is opened in row i; the largest motion of its joints from q [rad or m]."""
     first = hand.kin.dof_first[g]
-    moved = float(0.0)
     for d in range(hand.kin.dof_first[g + 1] - first):
         packed_out.q_pregrasp[i, hand.kin.dof_index[first + d]] = x[d]
-        moved = wp.max(moved, wp.abs(x[d] - q[d]))
-    return moved
+    return joint_motion(hand, g, x, q)
 
 
 @wp.func

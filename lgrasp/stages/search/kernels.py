@@ -4,7 +4,6 @@ from enum import IntEnum
 
 import warp as wp
 
-from lgrasp.grasp.collision import body_depth_slice
 from lgrasp.grasp.structs import FURTHER, Candidates, Sets, further_contacts
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
@@ -18,8 +17,6 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, Usable, centred, put_contact
 
 wp.set_module_options(KERNEL_OPTIONS)
-
-_UNKNOWN = wp.constant(-1)  # whether a candidate sinks into the object
 
 
 class SearchCount(IntEnum):
@@ -58,10 +55,8 @@ def list_hits(tried: TriedSets, hits_out: Hits):
 
 
 @wp.func
-def _hit(hits: Hits, tried: TriedSets, i: wp.int32):
-    """Row and lane of hit i; the row is -1 if there is no such hit or it has failed already."""
-    if i >= hits.number[0]:
-        return int(-1), int(0)
+def hit_at(hits: Hits, tried: TriedSets, i: wp.int32):
+    """Row and lane of hit i; the row is -1 if it has failed already."""
     row = hits.start[i] // tried.score.shape[1]
     lane = hits.start[i] - row * tried.score.shape[1]
     if tried.score[row, lane] < 0.0:
@@ -98,19 +93,48 @@ def _contacts(
     return n
 
 
-@wp.kernel
-def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
-    """Scores of hits go below 0 when friction does not balance them."""
-    row, lane = _hit(hits, tried_out, wp.tid())
-    if row < 0:
-        return
+@wp.func
+def _balanced(
+    obj: Object, params: SearchValues, candidates: Candidates, tried: TriedSets, row: wp.int32, lane: wp.int32
+):
+    """True if friction balances a set."""
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    n = _contacts(obj, candidates, tried_out, row, lane, points, normals)
+    n = _contacts(obj, candidates, tried, row, lane, points, normals)
     centred(points, n, arms)
-    if not balances(arms, normals, n, params.friction * INSCRIBED, params.torque_scale, params.max_gswo):
-        tried_out.score[row, lane] = -1.0
+    return balances(arms, normals, n, params.friction * INSCRIBED, params.torque_scale, params.max_gswo)
+
+
+@wp.kernel
+def check_balance(hits: Hits, obj: Object, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
+    """Scores of hits go below 0 when friction does not balance them."""
+    for i in range(wp.tid(), hits.number[0], hits.stride):
+        row, lane = hit_at(hits, tried_out, i)
+        if row >= 0 and not _balanced(obj, params, candidates, tried_out, row, lane):
+            tried_out.score[row, lane] = -1.0
+
+
+@wp.func
+def _resists(
+    obj: Object,
+    params: SearchValues,
+    candidates: Candidates,
+    tried: TriedSets,
+    row: wp.int32,
+    lane: wp.int32,
+    rank: wp.int32,
+):
+    """True if a set holds the object against the load of a rank, from the hardest, 0."""
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    n = _contacts(obj, candidates, tried, row, lane, points, normals)
+    for c in range(n):
+        points[c] = points[c] - obj.com
+    turn = wp.quat_inverse(wp.transform_get_rotation(candidates.poses.pose[row]))
+    limit = params.max_unresisted_load
+    direction = by_difficulty(normals, n, params.friction, turn, rank)
+    return unresisted(points, normals, n, params.friction, turn, direction, limit, limit) <= limit
 
 
 @wp.kernel
@@ -122,20 +146,11 @@ def check_load(
     Args:
         first: of the directions that are tried, from the hardest, 0.
     """
-    i, rank = wp.tid()
-    row, lane = _hit(hits, tried_out, i)
-    if row < 0:
-        return
-    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    n = _contacts(obj, candidates, tried_out, row, lane, points, normals)
-    for c in range(n):
-        points[c] = points[c] - obj.com
-    turn = wp.quat_inverse(wp.transform_get_rotation(candidates.poses.pose[row]))
-    limit = params.max_unresisted_load
-    direction = by_difficulty(normals, n, params.friction, turn, first + rank)
-    if unresisted(points, normals, n, params.friction, turn, direction, limit, limit) > limit:
-        tried_out.score[row, lane] = -1.0
+    at, rank = wp.tid()
+    for i in range(at, hits.number[0], hits.stride):
+        row, lane = hit_at(hits, tried_out, i)
+        if row >= 0 and not _resists(obj, params, candidates, tried_out, row, lane, first + rank):
+            tried_out.score[row, lane] = -1.0
 
 
 @wp.kernel
@@ -148,83 +163,36 @@ def give_up(tried: TriedSets, usable_out: Usable):
     usable_out.size[row, g] = 0
 
 
-@wp.kernel
-def check_fingers(hits: Hits, hand: Hand, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
-    """One thread per (finger, finger, hit): scores of hits go below 0 when two fingers meet."""
-    g, h, i = wp.tid()
-    if h <= g:
-        return
-    row, lane = _hit(hits, tried_out, i)
-    if row < 0 or tried_out.chosen[row, lane, g] < 0 or tried_out.chosen[row, lane, h] < 0:
-        return
-    Xa = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    Xb = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    group_forward(hand.kin, g, candidates.q[row, g, tried_out.chosen[row, lane, g]], Xa, 0)
-    group_forward(hand.kin, h, candidates.q[row, h, tried_out.chosen[row, lane, h]], Xb, 0)
-    if not group_pairs_clear(hand, g + 1, h + 1, Xa, 0, Xb, 0, params.min_self_distance):
-        tried_out.score[row, lane] = -1.0
-
-
-@wp.kernel
-def find_sunk(
-    hits: Hits,
+@wp.func
+def _fingers_apart(
     hand: Hand,
-    obj: Object,
     params: SearchValues,
     candidates: Candidates,
     tried: TriedSets,
-    slices: wp.int32,
-    usable_out: Usable,
+    row: wp.int32,
+    lane: wp.int32,
+    g: wp.int32,
+    h: wp.int32,
 ):
-    """One thread per (slice, body, hit), so that neighbours do like work: fingers that sink into the object with a
-    body, at any point, as the filter would find.
-
-    Scores stay as they are, so that which candidates are looked at does not depend on which thread comes first.
-
-    Args:
-        slices: of the points of a body (:func:`~lgrasp.grasp.collision.depth_slices`).
-    """
-    k, b, i = wp.tid()
-    g = hand.body_group[b]
-    row, lane = _hit(hits, tried, i)
-    if row < 0 or g < 0:
-        return
-    m = tried.chosen[row, lane, g]
-    if m < 0 or usable_out.sunk[row, g, m] != _UNKNOWN:
-        return
-    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    j0 = group_forward(hand.kin, g, candidates.q[row, g, m], X, 0)
-    T = wp.transform_inverse(candidates.poses.pose[row]) * X[b - 1 - j0]
-    if body_depth_slice(hand, obj, b, T, params.max_penetration, k, slices) > params.max_penetration:
-        usable_out.sunk[row, g, m] = 1
+    """True if fingers g < h of a set do not meet."""
+    Xa = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    Xb = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    group_forward(hand.kin, g, candidates.q[row, g, tried.chosen[row, lane, g]], Xa, 0)
+    group_forward(hand.kin, h, candidates.q[row, h, tried.chosen[row, lane, h]], Xb, 0)
+    return group_pairs_clear(hand, g + 1, h + 1, Xa, 0, Xb, 0, params.min_self_distance)
 
 
 @wp.kernel
-def check_depth(hits: Hits, tried_out: TriedSets, usable_out: Usable):
-    """Scores of hits go below 0 when one of their fingers sinks into the object; the others are known to be clear."""
-    row, lane = _hit(hits, tried_out, wp.tid())
-    if row < 0:
+def check_fingers(hits: Hits, hand: Hand, params: SearchValues, candidates: Candidates, tried_out: TriedSets):
+    """One thread per (finger, finger, hit): scores of hits go below 0 when two fingers meet."""
+    g, h, at = wp.tid()
+    if h <= g:
         return
-    for g in range(tried_out.chosen.shape[2]):
-        m = tried_out.chosen[row, lane, g]
-        if m >= 0:
-            if usable_out.sunk[row, g, m] == 1:
-                tried_out.score[row, lane] = -1.0
-            else:
-                usable_out.sunk[row, g, m] = 0
-
-
-@wp.kernel
-def drop_sunk(usable_out: Usable):
-    """Candidates that were found to sink into the object leave the lists of (pose, group)."""
-    row, g = wp.tid()
-    n = int(0)
-    for k in range(usable_out.size[row, g]):
-        m = usable_out.candidate[row, g, k]
-        if usable_out.sunk[row, g, m] != 1:
-            usable_out.candidate[row, g, n] = m
-            n += 1
-    usable_out.size[row, g] = n
+    for i in range(at, hits.number[0], hits.stride):
+        row, lane = hit_at(hits, tried_out, i)
+        there = row >= 0 and tried_out.chosen[row, lane, g] >= 0 and tried_out.chosen[row, lane, h] >= 0
+        if there and not _fingers_apart(hand, params, candidates, tried_out, row, lane, g, h):
+            tried_out.score[row, lane] = -1.0
 
 
 @wp.func

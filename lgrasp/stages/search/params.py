@@ -61,6 +61,11 @@ class SearchParams(Params):
         description="swap: fingers of a set must be clear of the object by every surface point; postures that are not "
         "are left out of later starts.",
     )
+    check_opening: bool = Field(
+        default=False,
+        description="swap: the same for fingers that cannot open by bounds.min_pregrasp_opening, or would close from "
+        "farther than bounds.max_closing_travel.",
+    )
     per_pose: int = Field(default=3, ge=1, le=MAX_RESTARTS, description="Most sets per pose.")
     taper: bool = Field(
         default=False,

@@ -29,7 +29,6 @@ class SearchValues:
     friction: wp.float32
     max_gswo: wp.float32
     max_unresisted_load: wp.float32
-    max_penetration: wp.float32  # [m]
     least_force: wp.float32
     torque_scale: wp.float32  # [1/m]
     moves: wp.int32
@@ -49,7 +48,7 @@ class Usable:
 
     size: wp.array2d(dtype=wp.int32)  # (P, G) how many
     candidate: wp.array3d(dtype=wp.int32)  # (P, G, M) which: the first ``size``
-    sunk: wp.array3d(dtype=wp.int32)  # (P, G, M) 1: in the object, 0: clear, -1: unknown; or (0, 0, 0)
+    unfit: wp.array3d(dtype=wp.int32)  # (P, G, M) 1: the filter would refuse it, 0: not, -1: unknown; or (0, 0, 0)
     point: wp.array3d(dtype=wp.vec3)  # (P, G, M) where they are on the object [m]; (0, 0, 0) if nobody asks
     ranked: wp.int32  # 1: those of most contacts come first, and are drawn more often
 
@@ -68,6 +67,16 @@ class Hits:
 
     number: wp.array(dtype=wp.int32)  # (1,) how many
     start: wp.array(dtype=wp.int32)  # (P L,) flat places: the first ``number``
+    stride: wp.int32  # threads that share them
+
+
+@wp.struct
+class Asked:
+    """Candidates that are looked at."""
+
+    number: wp.array(dtype=wp.int32)  # (1,) how many
+    place: wp.array(dtype=wp.int32)  # (P G M,) flat places: the first ``number``
+    stride: wp.int32  # threads that share them
 
 
 @wp.struct

@@ -3,9 +3,11 @@
 import math
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from lgrasp.errors import ConfigError
+from lgrasp.grasp.check_structs import device_limits
 from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, ContactSets
@@ -15,14 +17,12 @@ from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
+from lgrasp.stages.search.finger_kernels import UNKNOWN, check_fit, drop_unfit, find_stuck, find_sunk, list_fingers
 from lgrasp.stages.search.kernels import (
     SearchCount,
     check_balance,
-    check_depth,
     check_fingers,
     check_load,
-    drop_sunk,
-    find_sunk,
     give_up,
     keep_sets,
     list_hits,
@@ -31,7 +31,7 @@ from lgrasp.stages.search.kernels import (
 )
 from lgrasp.stages.search.mutate_kernels import mutate_contacts
 from lgrasp.stages.search.params import MAX_KINDS, SearchParams
-from lgrasp.stages.search.sets import FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
+from lgrasp.stages.search.sets import Asked, FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
 from lgrasp.stages.search.swap_kernels import swap_contacts
 
 VERSION = 12
@@ -39,6 +39,7 @@ VERSION = 12
 _CPU_STARTS = 2  # of a pose in one launch
 _GPU_STARTS = 10  # and on every device where what is left out of later starts depends on it
 _MOST_STARTS = 40  # there: as many as came before, so that many starts take few launches
+_THREADS = 1 << 18  # most of a check, however few sets are left
 
 
 def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple[ContactSets, Tally]:
@@ -57,9 +58,9 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     number = wp.zeros(n, dtype=wp.int32, device=d)
     found = empty_struct(FoundSets, d, n, params.per_pose, groups, number=number)
     swap = params.method == "swap"
-    exact = swap and params.check_depth and context.realised
+    exact = swap and (params.check_depth or params.check_opening) and context.realised
     shape = (n, groups, keep) if exact else (0, 0, 0)
-    given: dict[str, Any] = {"sunk": wp.full(shape, -1, dtype=wp.int32, device=d)}
+    given: dict[str, Any] = {"unfit": wp.full(shape, int(UNKNOWN), dtype=wp.int32, device=d)}
     given |= {"point": wp.empty((0, 0, 0), dtype=wp.vec3, device=d)} if swap else {}
     given["ranked"] = int(inputs.further.shape[2] > 0)
     usable = empty_struct(Usable, d, n, groups, keep, **given)
@@ -80,7 +81,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
         wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
         if swap:
-            _check_sets(tried, usable, values, inputs, context, exact, first == 0)
+            _check_sets(tried, usable, values, inputs, context, params, early=first == 0)
         wp.launch(keep_sets, n, [values, inputs.struct, tried], [found], device=d)
         first += lanes
     upto = wp.clone(found.number)
@@ -93,7 +94,14 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
 
 
 def _check_sets(
-    tried: TriedSets, usable: Usable, values: Any, inputs: CandidateTable, context: Context, exact: bool, early: bool
+    tried: TriedSets,
+    usable: Usable,
+    values: Any,
+    inputs: CandidateTable,
+    context: Context,
+    params: SearchParams,
+    *,
+    early: bool,
 ) -> None:
     """Scores of tried sets go below 0 where a set fails; each check comes side by side for those that are left.
 
@@ -102,29 +110,60 @@ def _check_sets(
     """
     d, size = context.device, tried.score.size
     hand, obj = context.hand.struct, context.object.struct
-    hits = empty_struct(Hits, d, size, number=wp.zeros(1, dtype=wp.int32, device=d))
+    hits = empty_struct(Hits, d, size, **_no_entries(d))
 
-    def check(kernel: wp.Kernel, dim: int | tuple[int, ...], asked: list[Any], outputs: list[Any]) -> None:
+    def check(kernel: wp.Kernel, dim: tuple[int, ...], asked: list[Any], outputs: list[Any]) -> None:
         hits.number.zero_()
         wp.launch(list_hits, tried.score.shape, [tried], [hits], device=d)
+        hits.stride, dim = _shared(size, dim)
         wp.launch(kernel, dim, [hits, *asked], outputs, device=d)
 
     sets = [obj, values, inputs.struct]
     if _bounds_load(values):
         # most fail in the hardest direction: it comes alone
         for some, directions in ((0, 1), (1, LOAD_DIRECTIONS - 1)):
-            check(check_load, (size, directions), [obj, values, some, inputs.struct], [tried])
+            check(check_load, (-1, directions), [obj, values, some, inputs.struct], [tried])
             if early and some == 0:
                 wp.launch(give_up, usable.size.shape, [tried], [usable], device=d)
-    check(check_balance, size, sets, [tried])
-    if context.realised:
-        groups = context.hand.model.groups
-        check(check_fingers, (groups, groups, size), [hand, values, inputs.struct], [tried])
-    if exact:
-        slices, bodies = depth_slices(d), len(context.hand.model.piece_first) - 1
-        check(find_sunk, (slices, bodies, size), [hand, *sets, tried, slices], [usable])
-        wp.launch(check_depth, size, [hits], [tried, usable], device=d)
-        wp.launch(drop_sunk, usable.size.shape, [], [usable], device=d)
+    check(check_balance, (-1,), sets, [tried])
+    if not context.realised:
+        return
+    groups = context.hand.model.groups
+    check(check_fingers, (groups, groups, -1), [hand, values, inputs.struct], [tried])
+    if usable.unfit.size:
+        asked = empty_struct(Asked, d, usable.unfit.size, **_no_entries(d))
+        check(list_fingers, (groups, -1), [tried], [usable, asked])
+        _check_fingers(asked, usable, inputs, context, params)
+        check(check_fit, (-1,), [usable], [tried])
+        wp.launch(drop_unfit, usable.size.shape, [], [usable], device=d)
+
+
+def _check_fingers(
+    asked: Asked, usable: Usable, inputs: CandidateTable, context: Context, params: SearchParams
+) -> None:
+    """Which of the candidates that are listed the filter would refuse."""
+    d, size, limits = context.device, usable.unfit.size, device_limits(context.bounds)
+    hand, obj, table = context.hand.struct, context.object.struct, inputs.struct
+    if params.check_depth:
+        slices, bodies = depth_slices(d), int(np.diff(context.hand.model.tree.joint_first).max())
+        asked.stride, dim = _shared(size, (slices, bodies, -1))
+        wp.launch(find_sunk, dim, [asked, hand, obj, limits, table, slices], [usable], device=d)
+    if params.check_opening:
+        asked.stride, dim = _shared(size, (-1,))
+        given = [asked, hand, context.field.struct, obj, context.held.struct, limits, table]
+        wp.launch(find_stuck, dim, given, [usable], device=d)
+
+
+def _no_entries(device: str) -> dict[str, Any]:
+    """What an empty list begins with."""
+    return {"number": wp.zeros(1, dtype=wp.int32, device=device), "stride": 0}
+
+
+def _shared(size: int, dim: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+    """How many threads share at most ``size`` things, of which there may be few, and ``dim`` with these for -1."""
+    others = math.prod(n for n in dim if n > 0)
+    threads = max(1, min(size, _THREADS // others))
+    return threads, tuple(threads if n < 0 else n for n in dim)
 
 
 def _bounds_load(values: Any) -> bool:

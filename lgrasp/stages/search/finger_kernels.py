@@ -1,0 +1,165 @@
+"""Kernels of the search stage that find fingers of hits which the filter would refuse, looking at each once."""
+
+import warp as wp
+
+from lgrasp.field.arrays import Field
+from lgrasp.grasp.check_structs import Limits
+from lgrasp.grasp.collision import body_depth_slice
+from lgrasp.grasp.control_kernels import shift_contact
+from lgrasp.grasp.held import Held
+from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, finger_clear, joint_motion, opened_finger
+from lgrasp.grasp.structs import Candidates
+from lgrasp.hand.arrays import Hand
+from lgrasp.math.kinematics import group_forward
+from lgrasp.math.limits import MAX_BODIES, MAX_JOINTS
+from lgrasp.object.arrays import Object
+from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.stages.search.kernels import hit_at
+from lgrasp.stages.search.sets import Asked, Hits, TriedSets, Usable
+
+wp.set_module_options(KERNEL_OPTIONS)
+
+UNKNOWN = wp.constant(-1)
+"""Nobody has looked at a candidate yet."""
+_FIT, _UNFIT = wp.constant(0), wp.constant(1)
+
+
+@wp.kernel
+def list_fingers(hits: Hits, tried: TriedSets, usable_out: Usable, asked_out: Asked):
+    """One thread per (group, hit): candidates that nobody has looked at, which are fit until something is found; their
+    number is zero on entry."""
+    g, at = wp.tid()
+    for i in range(at, hits.number[0], hits.stride):
+        row, lane = hit_at(hits, tried, i)
+        if row >= 0:
+            m = tried.chosen[row, lane, g]
+            if m >= 0 and wp.atomic_max(usable_out.unfit, row, g, wp.max(m, 0), _FIT) == UNKNOWN:
+                shape = usable_out.unfit.shape
+                asked_out.place[wp.atomic_add(asked_out.number, 0, 1)] = (row * shape[1] + g) * shape[2] + m
+
+
+@wp.func
+def _asked_at(asked: Asked, candidates: Candidates, i: wp.int32):
+    """Row, group and candidate of one that is listed."""
+    slots = candidates.state.shape[2]
+    groups = candidates.state.shape[1]
+    place = asked.place[i]
+    return place // (groups * slots), (place // slots) % groups, place % slots
+
+
+@wp.func
+def _body_sinks(
+    hand: Hand,
+    obj: Object,
+    limit: wp.float32,
+    candidates: Candidates,
+    row: wp.int32,
+    g: wp.int32,
+    m: wp.int32,
+    j: wp.int32,
+    k: wp.int32,
+    slices: wp.int32,
+):
+    """True if body j of a finger is in the object by more than ``limit`` [m] in slice k of its points."""
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    j0 = group_forward(hand.kin, g, candidates.q[row, g, m], X, 0)
+    T = wp.transform_inverse(candidates.poses.pose[row]) * X[j]
+    return body_depth_slice(hand, obj, 1 + j0 + j, T, limit, k, slices) > limit
+
+
+@wp.kernel
+def find_sunk(
+    asked: Asked, hand: Hand, obj: Object, limits: Limits, candidates: Candidates, slices: wp.int32, usable_out: Usable
+):
+    """One thread per (slice, body of a finger, candidate listed), so that neighbours do like work: fingers that sink
+    into the object with a body, at any point, as the filter would find.
+
+    Args:
+        slices: of the points of a body (:func:`~lgrasp.grasp.collision.depth_slices`).
+    """
+    k, j, at = wp.tid()
+    for i in range(at, asked.number[0], asked.stride):
+        row, g, m = _asked_at(asked, candidates, i)
+        there = j < hand.kin.joint_first[g + 1] - hand.kin.joint_first[g] and usable_out.unfit[row, g, m] == _FIT
+        if there and _body_sinks(hand, obj, limits.max_penetration, candidates, row, g, m, j, k, slices):
+            usable_out.unfit[row, g, m] = _UNFIT
+
+
+@wp.func
+def _opens(
+    hand: Hand,
+    field: Field,
+    obj: Object,
+    held: Held,
+    limits: Limits,
+    candidates: Candidates,
+    row: wp.int32,
+    g: wp.int32,
+    m: wp.int32,
+):
+    """True if a finger by itself can come off the object, as far as ``min_pregrasp_opening`` and
+    ``max_closing_travel`` ask."""
+    q = candidates.q[row, g, m]
+    pose = candidates.poses.pose[row]
+    h = candidates.poses.index[row] // held.tries
+    s = candidates.surface[row, g, m]
+    first = hand.kin.joint_first[g]
+    j = hand.contacts.body[field.point[candidates.record[row, g, m]]] - 1 - first
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    group_forward(hand.kin, g, q, X, first)
+    local = wp.transform_point(wp.transform_inverse(X[first + j]), wp.transform_point(pose, obj.contact_points[s]))
+    away = wp.transform_vector(pose, obj.contact_normals[s]) * limits.pregrasp_distance
+    opened = shift_contact(hand, g, q, j, local, away)
+    for t in range(FINGER_TRIES):
+        x = opened_finger(hand, held, h, g, t, q, opened)
+        moved = joint_motion(hand, g, x, q)
+        if moved >= limits.min_pregrasp_opening:
+            group_forward(hand.kin, g, x, X, first)
+            if finger_clear(hand, obj, held, limits, h, g, pose, candidates.poses.resting[row], X) == 1:
+                return moved <= limits.max_closing_travel
+    return False
+
+
+@wp.kernel
+def find_stuck(
+    asked: Asked,
+    hand: Hand,
+    field: Field,
+    obj: Object,
+    held: Held,
+    limits: Limits,
+    candidates: Candidates,
+    usable_out: Usable,
+):
+    """One thread per candidate listed: fingers that cannot open, or would have to close from too far, as the filter
+    would find of most."""
+    for i in range(wp.tid(), asked.number[0], asked.stride):
+        row, g, m = _asked_at(asked, candidates, i)
+        fit = usable_out.unfit[row, g, m] == _FIT
+        if fit and not _opens(hand, field, obj, held, limits, candidates, row, g, m):
+            usable_out.unfit[row, g, m] = _UNFIT
+
+
+@wp.kernel
+def check_fit(hits: Hits, usable: Usable, tried_out: TriedSets):
+    """Scores of hits go below 0 when one of their fingers is unfit."""
+    for i in range(wp.tid(), hits.number[0], hits.stride):
+        row, lane = hit_at(hits, tried_out, i)
+        if row >= 0:
+            for g in range(tried_out.chosen.shape[2]):
+                m = tried_out.chosen[row, lane, g]
+                if m >= 0 and usable.unfit[row, g, wp.max(m, 0)] == _UNFIT:
+                    tried_out.score[row, lane] = -1.0
+
+
+@wp.kernel
+def drop_unfit(usable_out: Usable):
+    """Candidates that were found to be unfit leave the lists of (pose, group)."""
+    row, g = wp.tid()
+    n = int(0)
+    for k in range(usable_out.size[row, g]):
+        m = usable_out.candidate[row, g, k]
+        if usable_out.unfit[row, g, m] != _UNFIT:
+            usable_out.candidate[row, g, n] = m
+            n += 1
+    usable_out.size[row, g] = n
