@@ -47,6 +47,19 @@ def list_usable(obj: Object, state: wp.int32, candidates: Candidates, usable_out
 
 
 @wp.kernel
+def leave_poor(params: SearchValues, candidates: Candidates, usable_out: Usable):
+    """Poses are left alone where all fingers together, each with its richest candidate, make too few contacts."""
+    row = wp.tid()
+    most = wp.where(candidates.poses.palm_surface[row] >= 0, 1, 0)
+    for g in range(usable_out.size.shape[1]):
+        if usable_out.size[row, g] > 0:
+            most += 1 + further_contacts(candidates, row, g, usable_out.candidate[row, g, 0])
+    if most < params.min_contacts:
+        for g in range(usable_out.size.shape[1]):
+            usable_out.size[row, g] = 0
+
+
+@wp.kernel
 def list_hits(tried: TriedSets, hits_out: Hits):
     """The starts whose set stands, in any order; their number is zero on entry."""
     row, lane = wp.tid()

@@ -25,6 +25,7 @@ from lgrasp.stages.search.kernels import (
     check_load,
     give_up,
     keep_sets,
+    leave_poor,
     list_hits,
     list_usable,
     take_sets,
@@ -67,6 +68,8 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     obj, values = context.object.struct, _values(params, context)
     state = State.REALISED if context.realised else State.DRAWN
     wp.launch(list_usable, (n, groups), [obj, int(state), inputs.struct], [usable], device=d)
+    if usable.ranked:
+        wp.launch(leave_poor, n, [values, inputs.struct], [usable], device=d)
     kernel = (swap_contacts if swap else mutate_contacts)[params.score]
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
     paced = exact or (swap and _bounds_load(values))
@@ -136,6 +139,8 @@ def _check_sets(
         _check_fingers(asked, usable, inputs, context, params)
         check(check_fit, (-1,), [usable], [tried])
         wp.launch(drop_unfit, usable.size.shape, [], [usable], device=d)
+        if usable.ranked:
+            wp.launch(leave_poor, usable.size.shape[0], [values, inputs.struct], [usable], device=d)
 
 
 def _check_fingers(
