@@ -10,6 +10,7 @@ from lgrasp.grasp.held import Held
 from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, finger_clear, joint_motion, opened_finger
 from lgrasp.grasp.structs import Candidates
 from lgrasp.hand.arrays import Hand
+from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_BODIES, MAX_JOINTS
 from lgrasp.object.arrays import Object
@@ -36,6 +37,18 @@ def list_fingers(hits: Hits, tried: TriedSets, usable_out: Usable, asked_out: As
             if m >= 0 and wp.atomic_max(usable_out.unfit, row, g, wp.max(m, 0), _FIT) == UNKNOWN:
                 shape = usable_out.unfit.shape
                 asked_out.place[wp.atomic_add(asked_out.number, 0, 1)] = (row * shape[1] + g) * shape[2] + m
+
+
+@wp.kernel
+def list_candidates(usable: Usable, asked_out: Asked):
+    """One thread per (pose, group): the usable candidates; their number is zero on entry."""
+    row, g = wp.tid()
+    shape = usable.unfit.shape
+    n = usable.size[row, g]
+    if n > 0:
+        at = wp.atomic_add(asked_out.number, 0, n)
+        for k in range(n):
+            asked_out.place[at + k] = (row * shape[1] + g) * shape[2] + usable.candidate[row, g, k]
 
 
 @wp.func
@@ -65,6 +78,44 @@ def _body_sinks(
     j0 = group_forward(hand.kin, g, candidates.q[row, g, m], X, 0)
     T = wp.transform_inverse(candidates.poses.pose[row]) * X[j]
     return body_depth_slice(hand, obj, 1 + j0 + j, T, limit, k, slices) > limit
+
+
+@wp.func
+def _met(
+    hand: Hand,
+    candidates: Candidates,
+    usable: Usable,
+    margin: wp.float32,
+    row: wp.int32,
+    g: wp.int32,
+    m: wp.int32,
+    h: wp.int32,
+):
+    """Bit k: a finger g < h meets finger h in its candidate k, or comes nearer than ``margin`` [m]."""
+    Xa = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    Xb = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    group_forward(hand.kin, g, candidates.q[row, g, m], Xa, 0)
+    bits = wp.uint32(0)
+    for i in range(usable.size[row, h]):
+        k = usable.candidate[row, h, i]
+        group_forward(hand.kin, h, candidates.q[row, h, k], Xb, 0)
+        if not group_pairs_clear(hand, g + 1, h + 1, Xa, 0, Xb, 0, margin):
+            bits = bits | (wp.uint32(1) << wp.uint32(k))
+    return bits
+
+
+@wp.kernel
+def find_clashes(asked: Asked, hand: Hand, limits: Limits, candidates: Candidates, usable_out: Usable):
+    """One thread per (finger, candidate listed): which postures of the two fingers meet; ``clash`` is zero on entry."""
+    h, at = wp.tid()
+    for i in range(at, asked.number[0], asked.stride):
+        row, g, m = _asked_at(asked, candidates, i)
+        if h > g and usable_out.size[row, h] > 0:
+            bits = _met(hand, candidates, usable_out, limits.min_self_distance, row, g, m, h)
+            usable_out.clash[row, g, m, h] = bits
+            for k in range(usable_out.unfit.shape[2]):
+                if ((bits >> wp.uint32(k)) & wp.uint32(1)) == wp.uint32(1):
+                    wp.atomic_or(usable_out.clash, row, h, k, g, wp.uint32(1) << wp.uint32(m))
 
 
 @wp.kernel

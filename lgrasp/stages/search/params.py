@@ -66,6 +66,11 @@ class SearchParams(Params):
         description="swap: the same for fingers that cannot open by bounds.min_pregrasp_opening, or would close from "
         "farther than bounds.max_closing_travel.",
     )
+    check_pairs: bool = Field(
+        default=False,
+        description="swap: which postures of two fingers meet is found before sets are made, where a finger has at "
+        "most 32, and no start combines them; pays where most sets fail by that.",
+    )
     per_pose: int = Field(default=3, ge=1, le=MAX_RESTARTS, description="Most sets per pose.")
     taper: bool = Field(
         default=False,

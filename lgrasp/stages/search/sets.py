@@ -49,6 +49,7 @@ class Usable:
     size: wp.array2d(dtype=wp.int32)  # (P, G) how many
     candidate: wp.array3d(dtype=wp.int32)  # (P, G, M) which: the first ``size``
     unfit: wp.array3d(dtype=wp.int32)  # (P, G, M) 1: the filter would refuse it, 0: not, -1: unknown; or (0, 0, 0)
+    clash: wp.array4d(dtype=wp.uint32)  # (P, G, M, G) bit m: meets candidate m of that group; or (0, 0, 0, 0)
     point: wp.array3d(dtype=wp.vec3)  # (P, G, M) where they are on the object [m]; (0, 0, 0) if nobody asks
     ranked: wp.int32  # 1: those of most contacts come first, and are drawn more often
 
@@ -121,13 +122,38 @@ MEASURES = {"fswo": _frictionless, "gswo": _with_friction}
 
 
 @wp.func
-def any_usable(usable: Usable, row: wp.int32, g: wp.int32, u: wp.float32):
-    """One of the usable candidates of a group, u in [0, 1)."""
+def meeting(usable: Usable, row: wp.int32, g: wp.int32, chosen: vec_set):
+    """Bit m: candidate m of a group meets one that another group has chosen."""
+    bits = wp.uint32(0)
+    if usable.clash.shape[0] > 0:
+        for h in range(usable.size.shape[1]):
+            if h != g and chosen[h] >= 0:
+                bits = bits | usable.clash[row, h, wp.max(chosen[h], 0), g]
+    return bits
+
+
+@wp.func
+def any_usable(usable: Usable, row: wp.int32, g: wp.int32, chosen: vec_set, u: wp.float32):
+    """One of the usable candidates of a group that meets none of the others chosen, u in [0, 1); -1: there is none."""
     n = usable.size[row, g]
     at = u
     if usable.ranked == 1:
         at = u * u
-    return usable.candidate[row, g, wp.min(int(at * float(n)), n - 1)]
+    bits = meeting(usable, row, g, chosen)
+    if bits == wp.uint32(0):
+        return usable.candidate[row, g, wp.min(int(at * float(n)), n - 1)]
+    free = int(0)
+    for k in range(n):
+        free += 1 - int((bits >> wp.uint32(usable.candidate[row, g, k])) & wp.uint32(1))
+    left = wp.min(int(at * float(free)), free - 1)
+    found = int(-1)
+    for k in range(n):
+        m = usable.candidate[row, g, k]
+        if found < 0 and ((bits >> wp.uint32(m)) & wp.uint32(1)) == wp.uint32(0):
+            if left == 0:
+                found = m
+            left -= 1
+    return found
 
 
 @wp.func
@@ -178,7 +204,9 @@ def start_set(
     for g in range(G):
         if usable.size[row, g] > 0:
             if wp.randf(own) * float(left) < float(k - n):
-                m = any_usable(usable, row, g, wp.randf(own))
+                m = any_usable(usable, row, g, chosen, wp.randf(own))
+                if m < 0:
+                    return int(0), int(0), chosen, owner, own
                 chosen[g] = m
                 owner[n] = g
                 n = put_contact(obj, candidates.surface[row, g, m], n, points, normals)

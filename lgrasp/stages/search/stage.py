@@ -17,7 +17,16 @@ from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.search.finger_kernels import UNKNOWN, check_fit, drop_unfit, find_stuck, find_sunk, list_fingers
+from lgrasp.stages.search.finger_kernels import (
+    UNKNOWN,
+    check_fit,
+    drop_unfit,
+    find_clashes,
+    find_stuck,
+    find_sunk,
+    list_candidates,
+    list_fingers,
+)
 from lgrasp.stages.search.kernels import (
     SearchCount,
     check_balance,
@@ -40,6 +49,7 @@ VERSION = 12
 _CPU_STARTS = 2  # of a pose in one launch
 _GPU_STARTS = 10  # and on every device where what is left out of later starts depends on it
 _MOST_STARTS = 40  # there: as many as came before, so that many starts take few launches
+_MOST_PAIRED = 32  # candidates of a finger, bits of a word
 _THREADS = 1 << 18  # most of a check, however few sets are left
 
 
@@ -62,6 +72,8 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     exact = swap and (params.check_depth or params.check_opening) and context.realised
     shape = (n, groups, keep) if exact else (0, 0, 0)
     given: dict[str, Any] = {"unfit": wp.full(shape, int(UNKNOWN), dtype=wp.int32, device=d)}
+    pairs = exact and params.check_pairs and keep <= _MOST_PAIRED
+    given["clash"] = wp.zeros((*shape, groups) if pairs else (0, 0, 0, 0), dtype=wp.uint32, device=d)
     given |= {"point": wp.empty((0, 0, 0), dtype=wp.vec3, device=d)} if swap else {}
     given["ranked"] = int(inputs.further.shape[2] > 0)
     usable = empty_struct(Usable, d, n, groups, keep, **given)
@@ -70,6 +82,8 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     wp.launch(list_usable, (n, groups), [obj, int(state), inputs.struct], [usable], device=d)
     if usable.ranked:
         wp.launch(leave_poor, n, [values, inputs.struct], [usable], device=d)
+    if pairs:
+        _find_clashes(usable, inputs, context)
     kernel = (swap_contacts if swap else mutate_contacts)[params.score]
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
     paced = exact or (swap and _bounds_load(values))
@@ -132,7 +146,8 @@ def _check_sets(
     if not context.realised:
         return
     groups = context.hand.model.groups
-    check(check_fingers, (groups, groups, -1), [hand, values, inputs.struct], [tried])
+    if not usable.clash.size:
+        check(check_fingers, (groups, groups, -1), [hand, values, inputs.struct], [tried])
     if usable.unfit.size:
         asked = empty_struct(Asked, d, usable.unfit.size, **_no_entries(d))
         check(list_fingers, (groups, -1), [tried], [usable, asked])
@@ -141,6 +156,16 @@ def _check_sets(
         wp.launch(drop_unfit, usable.size.shape, [], [usable], device=d)
         if usable.ranked:
             wp.launch(leave_poor, usable.size.shape[0], [values, inputs.struct], [usable], device=d)
+
+
+def _find_clashes(usable: Usable, inputs: CandidateTable, context: Context) -> None:
+    """Which usable candidates of two fingers meet."""
+    d, size, groups = context.device, usable.unfit.size, context.hand.model.groups
+    asked = empty_struct(Asked, d, size, **_no_entries(d))
+    wp.launch(list_candidates, usable.size.shape, [usable], [asked], device=d)
+    asked.stride, dim = _shared(size, (groups, -1))
+    given = [asked, context.hand.struct, device_limits(context.bounds), inputs.struct]
+    wp.launch(find_clashes, dim, given, [usable], device=d)
 
 
 def _check_fingers(

@@ -88,7 +88,7 @@ def _swapping(measure: Any) -> Any:
                 # replace the contact of one chosen group; keep what lowers the residual
                 i = free + wp.min(int(wp.randf(state) * float(k - free)), k - free - 1)
                 g = owner[i]
-                m = any_usable(usable, row, g, wp.randf(state))
+                m = any_usable(usable, row, g, chosen, wp.randf(state))
                 old_point = points[i]
                 old_normal = normals[i]
                 put_contact(obj, candidates.surface[row, g, m], i, points, normals)
@@ -112,10 +112,12 @@ def _swapping(measure: Any) -> Any:
                     if skip == 0:
                         added = g
                     skip -= 1
+            m = any_usable(usable, row, added, chosen, wp.randf(state))
+            if m < 0:
+                break
             if palm >= 0:
                 points[n] = points[k]
                 normals[n] = normals[k]
-            m = any_usable(usable, row, added, wp.randf(state))
             chosen[added] = m
             owner[k] = added
             put_contact(obj, candidates.surface[row, added, m], k, points, normals)
