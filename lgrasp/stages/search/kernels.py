@@ -54,6 +54,7 @@ def leave_poor(params: SearchValues, candidates: Candidates, usable_out: Usable)
     for g in range(usable_out.size.shape[1]):
         if usable_out.size[row, g] > 0:
             most += 1 + further_contacts(candidates, row, g, usable_out.candidate[row, g, 0])
+    usable_out.most[row] = most
     if most < params.min_contacts:
         for g in range(usable_out.size.shape[1]):
             usable_out.size[row, g] = 0

@@ -77,6 +77,13 @@ class SearchParams(Params):
         description="Later starts are for poses with few sets: with each further share of the starts a pose may have "
         "one set less.",
     )
+    rich_share: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="swap: share of the starts, early ones, that take only sets of a contact more than "
+        "bounds.min_contacts where fingers wrap enough for that.",
+    )
     passes: int = Field(default=1, ge=1, le=64, description="Rounds over the same candidates (multi-pass generation).")
     separation: float = Field(
         default=0.12, ge=0, le=3, description="Sets of one pose with the same fingers differ by this [rad]."

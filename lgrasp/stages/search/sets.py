@@ -25,6 +25,7 @@ class SearchValues:
     kinds: wp.int32  # entries of ``contacts``
     least: wp.int32  # fewest finger contacts
     min_contacts: wp.int32  # of fingers' links and the palm
+    more: wp.int32  # contacts beyond these, where a pose has them
     threshold: wp.float32  # of the squared residual
     friction: wp.float32
     max_gswo: wp.float32
@@ -48,6 +49,7 @@ class Usable:
 
     size: wp.array2d(dtype=wp.int32)  # (P, G) how many
     candidate: wp.array3d(dtype=wp.int32)  # (P, G, M) which: the first ``size``
+    most: wp.array(dtype=wp.int32)  # (P,) contacts that all fingers and the palm could make; or (0,)
     unfit: wp.array3d(dtype=wp.int32)  # (P, G, M) 1: the filter would refuse it, 0: not, -1: unknown; or (0, 0, 0)
     clash: wp.array4d(dtype=wp.uint32)  # (P, G, M, G) bit m: meets candidate m of that group; or (0, 0, 0, 0)
     point: wp.array3d(dtype=wp.vec3)  # (P, G, M) where they are on the object [m]; (0, 0, 0) if nobody asks

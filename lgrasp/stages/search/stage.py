@@ -75,6 +75,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     pairs = exact and params.check_pairs and keep <= _MOST_PAIRED
     given["clash"] = wp.zeros((*shape, groups) if pairs else (0, 0, 0, 0), dtype=wp.uint32, device=d)
     given |= {"point": wp.empty((0, 0, 0), dtype=wp.vec3, device=d)} if swap else {}
+    given["most"] = wp.empty(n if inputs.further.shape[2] else 0, dtype=wp.int32, device=d)
     given["ranked"] = int(inputs.further.shape[2] > 0)
     usable = empty_struct(Usable, d, n, groups, keep, **given)
     obj, values = context.object.struct, _values(params, context)
@@ -95,6 +96,7 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
         lanes = min(max(lanes, min(first // 2, _MOST_STARTS if paced else 0)), params.restarts - first)
         tried = make_struct(TriedSets, room, score=room.score[:, :lanes])
         values.per_pose = params.per_pose - (params.taper * params.per_pose * first) // params.restarts
+        values.more = int(usable.ranked and 0 < first < params.rich_share * params.restarts)
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
         wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
         if swap:
@@ -209,6 +211,7 @@ def _values(params: SearchParams, context: Context) -> Any:
         context.bounds,
         contacts=vec_kinds(*params.contacts, *[0] * (MAX_KINDS - kinds)),
         kinds=kinds,
+        more=0,
         least=context.steered.least,
         max_gswo=params.gswo_share * context.bounds.max_gswo,
         mutation_sigma=params.mutation_sigma * math.sqrt(model.area / len(model.contact_points)),

@@ -80,6 +80,9 @@ def _swapping(measure: Any) -> Any:
         for i in range(params.kinds):
             most = wp.max(most, params.contacts[i])
         most = wp.min(most, available)
+        least = params.min_contacts
+        if params.more > 0:
+            least = wp.min(least + params.more, usable.most[row])
         free = int(0)  # contacts before this one stay: they were searched in an earlier round
         for r in range(params.rounds):
             for _m in range(params.moves):
@@ -100,7 +103,7 @@ def _swapping(measure: Any) -> Any:
                     points[i] = old_point
                     normals[i] = old_normal
             stable = score[0] < goal and score[1] >= params.least_force
-            if stable and n + _further(candidates, row, chosen) >= params.min_contacts:
+            if stable and n + _further(candidates, row, chosen) >= least:
                 break
             if k >= most or r + 1 == params.rounds:
                 break
@@ -127,7 +130,7 @@ def _swapping(measure: Any) -> Any:
             score = measure(points, normals, n, params.friction, params.torque_scale)
         if score[0] >= goal or score[1] < params.least_force:
             return
-        if n + _further(candidates, row, chosen) < params.min_contacts:
+        if n + _further(candidates, row, chosen) < least:
             return
         for g in range(G):
             tried_out.chosen[row, lane, g] = chosen[g]
