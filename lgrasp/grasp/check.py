@@ -175,7 +175,7 @@ class Check:
         numbers = wp.empty((len(MEASURED), m), dtype=wp.float32, device=d)
         none = {"resting": wp.empty(0, dtype=wp.int32, device=d), "approach": wp.empty(0, dtype=wp.vec3, device=d)}
         packed = empty_struct(Packed, d, m, at.contact.shape[1], numbers=numbers, **postures, **none)
-        opened = wp.empty((m, model.groups), dtype=vec_dof, device=d)
+        opened = wp.empty((m, model.groups, 2), dtype=vec_dof, device=d)
         wp.launch(center_forces, m, [limits, places, at, row], [found], device=d)
         inputs = [hand, limits, places, at, found, row]
         wp.launch(control_poses, (m, model.groups), inputs, [packed, opened], device=d)

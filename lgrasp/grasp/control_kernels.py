@@ -5,15 +5,23 @@ import warp as wp
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.outcomes import KEPT, SQUEEZE
 from lgrasp.hand.arrays import Hand
+from lgrasp.math.cholesky import solving
 from lgrasp.math.constants import SLIDING_ARM
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
-from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
-from lgrasp.math.transforms import transforms
+from lgrasp.math.limits import MAX_CONTACTS, MAX_DOFS, MAX_JOINTS
+from lgrasp.math.transforms import transforms, vec3s
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _LEAST_FORCE = wp.constant(1.0e-6)  # [N]
+_SHIFT_STEPS = wp.constant(3)
+_SHIFT_DAMPING = wp.constant(1.0e-4)  # [m2/rad2]
+_SHIFT_STEP = wp.constant(0.4)  # [rad or m] of a joint, at most
+_TINY = wp.constant(1.0e-12)
+
+_mat_dof = wp.types.matrix((MAX_DOFS, MAX_DOFS), wp.float32)
+_solve_dofs = solving(MAX_DOFS)
 
 
 @wp.func
@@ -24,7 +32,7 @@ def shift_contact(hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, point: wp.v
     q = q0
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     target = wp.vec3(0.0)
-    for it in range(3):
+    for it in range(_SHIFT_STEPS):
         group_forward(hand.kin, g, q, X, 0)
         p = wp.transform_point(X[j], point)
         if it == 0:
@@ -37,12 +45,61 @@ def shift_contact(hand: Hand, g: wp.int32, q0: vec_dof, j: wp.int32, point: wp.v
             J[d] = J[d] + point_column(hand.kin, j0 + a, X[a], p)
             a = hand.kin.joint_parent[j0 + a]
         # damped right inverse: dq = J^T (J J^T + c I)^-1 e
-        A = wp.identity(n=3, dtype=wp.float32) * 1.0e-4
+        A = wp.identity(n=3, dtype=wp.float32) * _SHIFT_DAMPING
         for d in range(dofs):
             A = A + wp.outer(J[d], J[d])
         y = wp.inverse(A) * e
         for d in range(dofs):
-            q[d] = q[d] + wp.clamp(wp.dot(J[d], y), -0.4, 0.4)
+            q[d] = q[d] + wp.clamp(wp.dot(J[d], y), -_SHIFT_STEP, _SHIFT_STEP)
+        q = clamp_dofs(hand.kin, g, q)
+    return q
+
+
+@wp.func
+def back_off(
+    hand: Hand,
+    g: wp.int32,
+    q0: vec_dof,
+    contacts: wp.int32,
+    body: wp.array(dtype=wp.int32),
+    points: vec3s,
+    normals: vec3s,
+    distance: wp.float32,
+):
+    """Joint positions that move points of several bodies of a group by ``distance`` [m] along their normals, as well as
+    its joints can together (damped steps), limits kept.
+
+    Args:
+        body: of each contact, counted within the group.
+        points: in its frame [m].
+        normals: in the hand's frame.
+    """
+    j0 = hand.kin.joint_first[g]
+    dofs = hand.kin.dof_free[g]
+    q = q0
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    goal = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.float32)
+    for it in range(_SHIFT_STEPS):
+        group_forward(hand.kin, g, q, X, 0)
+        A = _mat_dof()
+        b = vec_dof()
+        for c in range(contacts):
+            p = wp.transform_point(X[body[c]], points[c])
+            at = wp.dot(p, normals[c])
+            if it == 0:
+                goal[c] = at + distance
+            J = vec_dof()
+            a = body[c]
+            while a >= 0:
+                d = hand.kin.joint_dof[j0 + a]
+                if d < dofs:
+                    J[d] = J[d] + wp.dot(point_column(hand.kin, j0 + a, X[a], p), normals[c])
+                a = hand.kin.joint_parent[j0 + a]
+            b += J * (goal[c] - at)
+            A += wp.outer(J, J)
+        step = _solve_dofs(A, b, dofs, _SHIFT_DAMPING, _TINY)
+        for d in range(dofs):
+            q[d] = q[d] + wp.clamp(step[d], -_SHIFT_STEP, _SHIFT_STEP)
         q = clamp_dofs(hand.kin, g, q)
     return q
 
@@ -81,15 +138,16 @@ def control_poses(
     found: Findings,
     row: wp.array(dtype=wp.int32),
     packed_out: Packed,
-    opened_out: wp.array2d(dtype=vec_dof),
+    opened_out: wp.array3d(dtype=vec_dof),
 ):
-    """One thread per (row kept, group): q, q that presses, and the posture with its first contact off the object.
+    """One thread per (row kept, group): q, q that presses, and the postures with its first contact, and with all of
+    them, off the object; the second is q where there is one contact.
 
     The squeeze presses with the balancing forces, ``squeeze_force`` [N] in all along the normals.
 
     Args:
         row: (m,) hand of each row, -1 none.
-        opened_out: (m, G) [rad or m].
+        opened_out: (m, G, 2) [rad or m].
     """
     i, g = wp.tid()
     s = row[i]
@@ -97,6 +155,9 @@ def control_poses(
         return
     x = at.posture[s, g]
     opened = x
+    body = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.int32)
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     pressed = x
     contacts = int(0)
     j0 = hand.kin.joint_first[g]
@@ -109,10 +170,11 @@ def control_poses(
                 p = wp.transform_point(T, places.points[at.surface[s, k]])
                 f = wp.transform_vector(T, found.force[s, k]) * limits.squeeze_force
                 target = press_contact(hand, g, x, b - 1 - j0, at.body[s], p, f, limits.squeeze_stiffness)
+                body[contacts] = b - 1 - j0
+                points[contacts] = wp.transform_point(wp.transform_inverse(at.body[s, b - 1]), p)
+                normals[contacts] = wp.transform_vector(T, places.normals[at.surface[s, k]])
                 if contacts == 0:
-                    n = wp.transform_vector(T, places.normals[at.surface[s, k]])
-                    local = wp.transform_point(wp.transform_inverse(at.body[s, b - 1]), p)
-                    opened = shift_contact(hand, g, x, b - 1 - j0, local, n * limits.pregrasp_distance)
+                    opened = shift_contact(hand, g, x, body[0], points[0], normals[0] * limits.pregrasp_distance)
                     pressed = target
                 else:
                     pressed = pressed + target - x
@@ -122,7 +184,11 @@ def control_poses(
         column = hand.kin.dof_index[first + d]
         packed_out.q[i, column] = x[d]
         packed_out.q_squeeze[i, column] = pressed[d]
-    opened_out[i, g] = opened
+    opened_out[i, g, 0] = opened
+    freed = x
+    if contacts > 1:
+        freed = back_off(hand, g, x, contacts, body, points, normals, limits.pregrasp_distance)
+    opened_out[i, g, 1] = freed
 
 
 @wp.kernel

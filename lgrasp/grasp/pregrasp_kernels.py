@@ -16,7 +16,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 OPENING_SHARES = wp.constant(5)
 """Shares of the way open that are tried."""
-FINGER_TRIES = wp.constant(2 * OPENING_SHARES)
+FINGER_TRIES = wp.constant(3 * OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
 _NOT_TOUCHING = wp.constant(1.0e6)  # opening of a hand no finger of which touches
 
@@ -79,7 +79,7 @@ def try_openings(
     held: Held,
     limits: Limits,
     at: CheckedPostures,
-    opened: wp.array2d(dtype=vec_dof),
+    opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
     clear_out: wp.array(dtype=wp.int32),
 ):
@@ -87,7 +87,7 @@ def try_openings(
     hand? Rows known to be clear when farther open are left alone.
 
     Args:
-        opened: (m, G) [rad or m].
+        opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
         row: (m,) hand of each row, -1 none.
         clear_out: (m,) bit t: try t is; of zeros.
     """
@@ -99,7 +99,7 @@ def try_openings(
     G = hand.kin.groups
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     for g in range(G):
-        x = _opened_share(at.posture[s, g], opened[i, g], t)
+        x = _opened_share(at.posture[s, g], opened[i, g, 0], t)
         group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
         clear = int(1)
         if at.chosen[s, g] >= 0:
@@ -125,7 +125,7 @@ def put_opening(i: wp.int32, least: wp.float32, most: wp.float32, packed_out: Pa
 def open_poses(
     hand: Hand,
     at: CheckedPostures,
-    opened: wp.array2d(dtype=vec_dof),
+    opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
     clear: wp.array(dtype=wp.int32),
     packed_out: Packed,
@@ -134,7 +134,7 @@ def open_poses(
     """The touching fingers as far open as is clear (:func:`try_openings`); rows of which no try is are listed.
 
     Args:
-        opened: (m, G) [rad or m].
+        opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
         row: (m,) hand of each row, -1 none.
         clear: (m,) bit t: try t is clear.
         stuck_out: (1 + m,) how many rows are listed, and these.
@@ -152,7 +152,7 @@ def open_poses(
     least = float(_NOT_TOUCHING)
     most = float(0.0)
     for g in range(hand.kin.groups):
-        x = _opened_share(at.posture[s, g], opened[i, g], t)
+        x = _opened_share(at.posture[s, g], opened[i, g, 0], t)
         moved = put_pregrasp(hand, g, x, at.posture[s, g], i, packed_out)
         most = wp.max(most, moved)
         if at.chosen[s, g] >= 0:
@@ -161,15 +161,26 @@ def open_poses(
 
 
 @wp.func
-def opened_finger(hand: Hand, held: Held, h: wp.int32, g: wp.int32, t: wp.int32, q: vec_dof, opened: vec_dof):
-    """A finger on its way from q to ``opened``, from all of it down, then on its way to the hand's open posture."""
+def opened_finger(
+    hand: Hand, held: Held, h: wp.int32, g: wp.int32, t: wp.int32, q: vec_dof, opened: vec_dof, freed: vec_dof
+):
+    """A finger on its way from q to ``opened``, from all of it down, so to ``freed``, then on its way to the open
+    posture of the hand."""
     if t < OPENING_SHARES:
         return _opened_share(q, opened, t)
+    if t < 2 * OPENING_SHARES:
+        return _opened_share(q, freed, t - OPENING_SHARES)
     away = held.posture[h, g] - q
     for d in range(hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]):
         if d >= hand.kin.dof_free[g] or (held.frozen[h, g] >> d) & 1 == 1:
             away[d] = 0.0
-    return q + (float(t + 1) / float(OPENING_SHARES) - 1.0) * away
+    return q + (float(t + 1) / float(OPENING_SHARES) - 2.0) * away
+
+
+@wp.func
+def _to_try(hand: Hand, g: wp.int32, t: wp.int32, q: vec_dof, freed: vec_dof):
+    """False for the way to ``freed`` of a finger with one contact."""
+    return t < OPENING_SHARES or t >= 2 * OPENING_SHARES or joint_motion(hand, g, freed, q) > 0.0
 
 
 @wp.kernel
@@ -179,7 +190,7 @@ def try_fingers(
     held: Held,
     limits: Limits,
     at: CheckedPostures,
-    opened: wp.array2d(dtype=vec_dof),
+    opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
     stuck: wp.array(dtype=wp.int32),
     clear_out: wp.array2d(dtype=wp.int32),
@@ -187,7 +198,7 @@ def try_fingers(
     """One thread per (row listed, group, try): is the finger off the object and what is held?
 
     Args:
-        opened: (m, G) [rad or m].
+        opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
         row: (m,) hand of each row, -1 none.
         stuck: (1 + m,) how many rows are listed, and these.
         clear_out: (m, G) bit t: try t is; of zeros.
@@ -197,11 +208,11 @@ def try_fingers(
         return
     i = stuck[1 + k]
     s = row[i]
-    if at.chosen[s, g] < 0:
+    if at.chosen[s, g] < 0 or not _to_try(hand, g, t, at.posture[s, g], opened[i, g, 1]):
         return
     h = at.index[at.of[s]] // held.tries
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    x = opened_finger(hand, held, h, g, t, at.posture[s, g], opened[i, g])
+    x = opened_finger(hand, held, h, g, t, at.posture[s, g], opened[i, g, 0], opened[i, g, 1])
     group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
     r = at.of[s]
     if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X) == 1:
@@ -214,7 +225,7 @@ def open_fingers(
     held: Held,
     limits: Limits,
     at: CheckedPostures,
-    opened: wp.array2d(dtype=vec_dof),
+    opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
     stuck: wp.array(dtype=wp.int32),
     clear: wp.array2d(dtype=wp.int32),
@@ -223,7 +234,7 @@ def open_fingers(
     """Each finger of the rows listed opened by itself, in turn: the first try that is clear of the hand as well, or q.
 
     Args:
-        opened: (m, G) [rad or m].
+        opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
         row: (m,) hand of each row, -1 none.
         stuck: (1 + m,) how many rows are listed, and these.
         clear: (m, G) bit t: try t is off the object and what is held.
@@ -245,7 +256,7 @@ def open_fingers(
         done = wp.where(at.chosen[s, g] >= 0, 0, 1)
         for t in range(FINGER_TRIES):
             if done == 0 and (clear[k, g] >> t) & 1 == 1:
-                x = opened_finger(hand, held, h, g, t, at.posture[s, g], opened[i, g])
+                x = opened_finger(hand, held, h, g, t, at.posture[s, g], opened[i, g, 0], opened[i, g, 1])
                 group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
                 done = int(1)
                 for b in range(G + 1):

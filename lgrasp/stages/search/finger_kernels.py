@@ -5,14 +5,14 @@ import warp as wp
 from lgrasp.field.arrays import Field
 from lgrasp.grasp.check_structs import Limits
 from lgrasp.grasp.collision import body_depth_slice
-from lgrasp.grasp.control_kernels import shift_contact
+from lgrasp.grasp.control_kernels import back_off, shift_contact
 from lgrasp.grasp.held import Held
 from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, finger_clear, joint_motion, opened_finger
-from lgrasp.grasp.structs import Candidates
+from lgrasp.grasp.structs import FURTHER, Candidates, further_contacts
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.kinematics import group_forward
-from lgrasp.math.limits import MAX_BODIES, MAX_JOINTS
+from lgrasp.math.limits import MAX_BODIES, MAX_CONTACTS, MAX_JOINTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.search.kernels import hit_at
@@ -153,16 +153,30 @@ def _opens(
     q = candidates.q[row, g, m]
     pose = candidates.poses.pose[row]
     h = candidates.poses.index[row] // held.tries
-    s = candidates.surface[row, g, m]
     first = hand.kin.joint_first[g]
-    j = hand.contacts.body[field.point[candidates.record[row, g, m]]] - 1 - first
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     group_forward(hand.kin, g, q, X, first)
-    local = wp.transform_point(wp.transform_inverse(X[first + j]), wp.transform_point(pose, obj.contact_points[s]))
-    away = wp.transform_vector(pose, obj.contact_normals[s]) * limits.pregrasp_distance
-    opened = shift_contact(hand, g, q, j, local, away)
+    body = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.int32)
+    points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
+    n = int(0)
+    for f in range(1 + further_contacts(candidates, row, g, m)):
+        place = field.point[candidates.record[row, g, m]]
+        s = candidates.surface[row, g, m]
+        if f > 0:
+            place = candidates.further[row, g, m][FURTHER + f - 1]
+            s = candidates.further[row, g, m][f - 1]
+        body[n] = hand.contacts.body[place] - 1 - first
+        p = wp.transform_point(pose, obj.contact_points[s])
+        points[n] = wp.transform_point(wp.transform_inverse(X[first + body[n]]), p)
+        normals[n] = wp.transform_vector(pose, obj.contact_normals[s])
+        n += 1
+    opened = shift_contact(hand, g, q, body[0], points[0], normals[0] * limits.pregrasp_distance)
+    freed = q
+    if n > 1:
+        freed = back_off(hand, g, q, n, body, points, normals, limits.pregrasp_distance)
     for t in range(FINGER_TRIES):
-        x = opened_finger(hand, held, h, g, t, q, opened)
+        x = opened_finger(hand, held, h, g, t, q, opened, freed)
         moved = joint_motion(hand, g, x, q)
         if moved >= limits.min_pregrasp_opening:
             group_forward(hand.kin, g, x, X, first)
