@@ -77,12 +77,12 @@ class SearchParams(Params):
         description="Later starts are for poses with few sets: with each further share of the starts a pose may have "
         "one set less.",
     )
-    rich_share: float = Field(
-        default=0.0,
+    extra_contacts: int = Field(
+        default=0,
         ge=0,
-        le=1,
-        description="swap: share of the starts, early ones, that take only sets of a contact more than "
-        "bounds.min_contacts where fingers wrap enough for that.",
+        le=5,
+        description="swap: contacts beyond bounds.min_contacts of sets, but for those of the first starts, at poses "
+        "where fingers wrap enough for that.",
     )
     passes: int = Field(default=1, ge=1, le=64, description="Rounds over the same candidates (multi-pass generation).")
     separation: float = Field(

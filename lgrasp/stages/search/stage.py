@@ -96,7 +96,8 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
         lanes = min(max(lanes, min(first // 2, _MOST_STARTS if paced else 0)), params.restarts - first)
         tried = make_struct(TriedSets, room, score=room.score[:, :lanes])
         values.per_pose = params.per_pose - (params.taper * params.per_pose * first) // params.restarts
-        values.more = int(usable.ranked and 0 < first < params.rich_share * params.restarts)
+        # none at first, so that poses are given up by sets of any
+        values.more = params.extra_contacts if usable.ranked and first else 0
         asked = [obj, values, context.seed("search", context.salt), first, inputs.struct, usable, found]
         wp.launch(kernel, tried.score.shape, asked, [tried], device=d)
         if swap:
