@@ -186,3 +186,16 @@ def test_fingers_are_clear_by_every_point(context, swift):
     rows = len(first["pose"])
     for name in ("pose", "slot", "chosen", "score"):
         np.testing.assert_array_equal(first[name], parts["exact"][name][:rows])
+
+
+def test_postures_that_meet_are_not_combined(context, swift):
+    """With check_pairs fingers of sets are as far apart as when each set is checked, and more sets stand."""
+    found, apart = {}, {}
+    for name, pairs in (("sets", False), ("pairs", True)):
+        pipeline = swift.with_params("search", check_depth=True, check_pairs=pairs, per_pose=12)
+        table = run_stages(pipeline, context, 0, 300, "search")
+        counts = run_filter(table, pipeline.params("filter"), context)[1]
+        found[name], apart[name] = len(table), counts["self-collision"] / sum(counts.values())
+    assert found["pairs"] >= found["sets"] > 50
+    assert apart["pairs"] < 0.05
+    assert apart["pairs"] < apart["sets"] + 0.02

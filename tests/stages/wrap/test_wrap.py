@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from scipy.spatial.transform import Rotation
 from support.urdfs import fingers
 
@@ -14,13 +15,16 @@ from lgrasp.engine.shard import shard_context
 from lgrasp.field.arrays import upload_field
 from lgrasp.field.build import build_field
 from lgrasp.field.params import FieldParams
+from lgrasp.grasp.control_kernels import back_off
 from lgrasp.grasp.structs import FURTHER, State
 from lgrasp.grasp.tables import CandidateTable
-from lgrasp.hand.arrays import upload_hand
+from lgrasp.hand.arrays import Hand, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.params import ThumbBend
 from lgrasp.hand.spec import Box, ContactRule, HandSpec
+from lgrasp.math.kinematics import vec_dof
 from lgrasp.math.limits import MAX_DOFS
+from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
@@ -134,6 +138,35 @@ def test_a_finger_in_the_object_is_blocked(gripper):
     assert table.arrays()["state"][0, 0, 0] == State.BLOCKED
 
 
+@wp.kernel
+def _back_off(hand: Hand, q: vec_dof, points: vec3s, normals: vec3s, q_out: wp.array(dtype=vec_dof)):
+    body = wp.zeros(shape=(2,), dtype=wp.int32)
+    body[1] = 1
+    q_out[0] = back_off(hand, 0, q, 2, body, points, normals, 0.006)
+
+
+def test_both_links_back_off(gripper):
+    """Two links of a finger come off along their normals as far as asked, which its two hinges can do."""
+    q, along = np.zeros(MAX_DOFS, np.float32), 0.03
+    q[:2] = START, 0.7
+    angles = np.cumsum(q[:2])
+    normals = np.array([[0, -np.cos(a), -np.sin(a)] for a in angles])
+    put = [wp.array(a, dtype=wp.vec3, device=gripper.device) for a in (np.tile([0, 0, along], (2, 1)), normals)]
+    out = wp.zeros(1, dtype=vec_dof, device=gripper.device)
+    wp.launch(_back_off, 1, [gripper.hand.struct, vec_dof(*q.tolist()), *put], [out], device=gripper.device)
+
+    def places(q):
+        hinge, found = np.zeros(2), []
+        for angle in np.cumsum(q[:2]):
+            way = np.array([-np.sin(angle), np.cos(angle)])
+            found.append(hinge + along * way)
+            hinge = hinge + LENGTH * way
+        return np.array(found)
+
+    moved = (places(out.numpy()[0]) - places(q)) * normals[:, 1:]
+    np.testing.assert_allclose(moved.sum(1), 0.006, atol=6e-4)
+
+
 @pytest.fixture(scope="module")
 def source(load, power):
     return load("bottle", power)
@@ -198,3 +231,28 @@ def test_contacts_that_search_counts_are_contacts_of_the_grasp(source, power):
     assert found["contact"] == 0
     assert ((grasps.contact_links >= 0).sum(1) >= power.bounds.min_contacts).all()
     assert grasps.metrics["pregrasp_opening"].min() >= power.bounds.min_pregrasp_opening > 0
+
+
+def test_search_leaves_out_fingers_that_cannot_open(source, power):
+    lost = {}
+    for name, opening in (("early", True), ("late", False)):
+        pipeline, meter = power.with_params("search", check_opening=opening), Meter(source.hand.device)
+        run_stages(pipeline, shard_context(power, source, 0), 0, 256, "filter", meter)
+        lost[name] = meter.counts["filter"]["squeeze"] / meter.counts["search"]["sets"]
+    assert lost["early"] < 0.6 * lost["late"]
+
+
+def test_sets_have_as_many_contacts_as_is_asked(source, power):
+    """Those of poses that could have more than the fewest."""
+
+    def contacts(extra):
+        pipeline = power.with_params("search", extra_contacts=extra)
+        arrays = run_stages(pipeline, shard_context(pipeline, source, 0), 0, 256, "search").arrays()
+        assert len(arrays["pose"]) > 20
+        group = np.arange(arrays["chosen"].shape[1])
+        further = arrays["candidates.further"][arrays["pose"][:, None], group, arrays["chosen"], :FURTHER] >= 0
+        used = arrays["chosen"] >= 0
+        palm = arrays["candidates.poses.palm_surface"][arrays["pose"]] >= 0
+        return (used.sum(1) + palm + (further.sum(2) * used).sum(1)).mean()
+
+    assert contacts(4) > contacts(0) + 0.1
