@@ -27,7 +27,6 @@ _PAD = 0.016
 _MOST_NODES, _LEAST_CELL = 250_000, 0.0015
 _CONTACTS = 4096
 _TRUSTED, _GUESSED = 0.003, 0.009  # [m] from what was seen: its distances hold; they are guessed
-_COARSE = 0.005  # [m]
 _BOX = (0.01, 0.99)  # shares of the points along an axis
 _FOLD_POINTS, _SMOOTH = 6, 0.85  # points whose normals tell a fold; their least cosine where there is none
 
@@ -70,7 +69,9 @@ def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud"
     return _model(name, digest.hexdigest(), center, points, normals, _distances(points, normals), points.mean(0), note)
 
 
-def completed_object(seen: ObjectModel, distance: Callable[[np.ndarray], np.ndarray], reach: float) -> ObjectModel:
+def completed_object(
+    seen: ObjectModel, distance: Callable[[np.ndarray], np.ndarray], inside: np.ndarray
+) -> ObjectModel:
     """The model of a cloud with the sides that nobody saw, as somebody guesses them; in the cloud's internal frame.
 
     Distances near what was seen stay, farther off they are those guessed.
@@ -78,13 +79,11 @@ def completed_object(seen: ObjectModel, distance: Callable[[np.ndarray], np.ndar
     Args:
         seen: what :func:`cloud_object` gave.
         distance: signed distances [m] guessed at places (n, 3) of the internal frame, (n,).
-        reach: how far from the internal origin the object may reach along each axis [m].
+        inside: places all over the inside, a few millimetres apart [m], (k, 3).
     """
     points, normals = seen.obstacle_points.astype(float), seen.obstacle_normals.astype(float)
     points, kept = np.unique(points, axis=0, return_index=True)
     normals, tree = normals[kept], cKDTree(points)
-    coarse = np.stack(np.meshgrid(*[np.arange(-reach, reach, _COARSE)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    inside = coarse[distance(coarse) < 0]
     whole = np.concatenate([points, inside])
     nodes, shape, cell = _lattice(whole.min(0) - _PAD, whole.max(0) + _PAD)
     value, away = distance(nodes), tree.query(nodes, distance_upper_bound=_GUESSED, workers=-1)[0]

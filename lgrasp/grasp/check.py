@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.grasp.approach_kernels import RETREATS, Palm, check_table, choose_approach, try_retreats
-from lgrasp.grasp.bounds import ANY_CLOSING, GraspBounds
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check_kernels import (
     ALL,
     check_postures,
@@ -24,7 +24,7 @@ from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed
 from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.control_kernels import control_poses, drop_limp, limit_squeeze, press_shared
 from lgrasp.grasp.held import HeldArrays, hold_nothing
-from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome, failed_squeeze
+from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome, bounds_squeeze, failed_squeeze
 from lgrasp.grasp.pregrasp_kernels import (
     FINGER_TRIES,
     OPENING_SHARES,
@@ -44,7 +44,7 @@ from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.runtime.fetch import fetch, to_numpy
 from lgrasp.runtime.scan import running_sums
-from lgrasp.runtime.structs import empty_struct, make_struct
+from lgrasp.runtime.structs import empty_struct, make_struct, on_device
 from lgrasp.runtime.tally import Tally, empty_tally, read_tallies
 
 _MAX_RANKED_PENETRATION = 0.03  # [m] penetrations above this are not distinguished
@@ -111,9 +111,7 @@ class Check:
         wp.launch(list_kept, len(self), [self.found, upto], [row], device=self.hand.device)
         packed, on_table = self._pack(seed, row), self.obj.planes is not None
         self._share(row, tally)
-        limits = self.limits
-        least = (limits.min_squeeze_travel, limits.min_stable_squeeze, limits.min_epsilon, limits.min_pregrasp_opening)
-        bounded = max(least) > 0.0 or limits.max_closing_travel < ANY_CLOSING
+        bounded = bounds_squeeze(self.limits)
         if bounded:
             wp.launch(drop_limp, len(self), [self.limits, packed], [row, tally.device], device=self.hand.device)
         if on_table:
@@ -234,8 +232,8 @@ def known_contacts(links: np.ndarray, points: np.ndarray, normals: np.ndarray, d
 def check_grasps(
     hand: HandArrays,
     obj: ObjectArrays,
-    pose: np.ndarray,
-    q: np.ndarray,
+    pose: np.ndarray | wp.array,
+    q: np.ndarray | wp.array,
     contacts: ContactTable,
     bounds: GraspBounds,
     *,
@@ -255,15 +253,56 @@ def check_grasps(
         index: candidate of each row; default: the row.
         seed: of the random rays of epsilon; default: 0.
     """
-    d, n, width, model = hand.device, len(q), contacts.link.shape[1], hand.model
-    zeros, rows = wp.zeros(n, dtype=wp.int32, device=d), np.arange(n)
+    limits = device_limits(bounds, deepest=_MAX_RANKED_PENETRATION)
+    check = _measured(hand, obj, pose, q, contacts, limits, around, resting)
+    seed = wp.zeros(1, dtype=wp.int32, device=hand.device) if seed is None else seed
+    table, outcome = check.every(seed, on_table=resting is not None)
+    table.index[:] = np.arange(len(check)) if index is None else index
+    return table, outcome
+
+
+def compare_grasps(
+    hand: HandArrays,
+    obj: ObjectArrays,
+    pose: np.ndarray | wp.array,
+    q: np.ndarray | wp.array,
+    contacts: ContactTable,
+    bounds: GraspBounds,
+    *,
+    around: ObjectArrays | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Outcomes of hands but for what control poses show, and unresisted loads, (n,) both: what :func:`check_grasps`
+    finds of these in several times the time.
+
+    Args: as of :func:`check_grasps`.
+    """
+    limits = device_limits(bounds, deepest=_MAX_RANKED_PENETRATION)
+    check = _measured(hand, obj, pose, q, contacts, limits, around, None)
+    check.decide()
+    outcome, load = fetch([check.found.outcome, check.found.unresisted_load])
+    return outcome, load
+
+
+def _measured(
+    hand: HandArrays,
+    obj: ObjectArrays,
+    pose: np.ndarray | wp.array,
+    q: np.ndarray | wp.array,
+    contacts: ContactTable,
+    limits: Limits,
+    around: ObjectArrays | None,
+    resting: np.ndarray | None,
+) -> Check:
+    """Hands of which all is measured but the forces; see :func:`check_grasps`."""
+    d, (n, width), model = hand.device, contacts.link.shape, hand.model
+    zeros = wp.zeros(n, dtype=wp.int32, device=d)
     surface = np.where(to_numpy(contacts.link) >= 0, np.arange(n * width).reshape(n, width), -1)
     at = empty_struct(
         CheckedPostures,
         d,
         *(n, model.groups),
-        pose=wp.array(pose, dtype=wp.transform, device=d),
-        of=wp.array(rows, dtype=wp.int32, device=d),
+        pose=on_device(pose, wp.transform, d),
+        of=wp.array(np.arange(n), dtype=wp.int32, device=d),
         index=zeros,
         resting=wp.array(np.full(n, -1) if resting is None else resting, dtype=wp.int32, device=d),
         slot=zeros,
@@ -271,20 +310,16 @@ def check_grasps(
         contact=contacts.link,
         surface=wp.array(surface, dtype=wp.int32, device=d),
     )
-    limits, places = device_limits(bounds, deepest=_MAX_RANKED_PENETRATION), link_places(model, contacts, d)
-    found = new_findings(n, width, d)
+    places, found = link_places(model, contacts, d), new_findings(n, width, d)
     check = Check(hand, obj, hold_nothing(hand), limits, places, at, found)
-    inputs = [hand.struct, check.held.struct, limits, places, wp.array(q, dtype=wp.float32, device=d)]
+    inputs = [hand.struct, check.held.struct, limits, places, on_device(q, wp.float32, d)]
     wp.launch(check_postures, n, inputs, [at, found], device=d)
     for solid in (obj, around):
         if solid is not None:
             check.measure(ALL, solid)
     if resting is not None:
         check.clear_table(ALL)
-    seed = wp.zeros(1, dtype=wp.int32, device=d) if seed is None else seed
-    table, outcome = check.every(seed, on_table=resting is not None)
-    table.index[:] = rows if index is None else index
-    return table, outcome
+    return check
 
 
 def link_places(model: HandModel, contacts: ContactTable, device: str) -> Places:

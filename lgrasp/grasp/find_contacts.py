@@ -13,7 +13,7 @@ from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface, contact_surface
 from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays
-from lgrasp.runtime.structs import empty_struct, upload_struct
+from lgrasp.runtime.structs import empty_struct, on_device, upload_struct
 
 
 class LinkTouches(NamedTuple):
@@ -28,8 +28,8 @@ class LinkTouches(NamedTuple):
 def find_contacts(
     hand: HandArrays,
     obj: ObjectArrays,
-    pose: np.ndarray,
-    q: np.ndarray,
+    pose: np.ndarray | wp.array,
+    q: np.ndarray | wp.array,
     bounds: GraspBounds,
     palmar: ContactSurface | None = None,
 ) -> ContactTable:
@@ -42,7 +42,7 @@ def find_contacts(
     """
     d = hand.device
     runs = palmar_runs(hand, palmar or contact_surface(hand.model))
-    at = [wp.array(pose, dtype=wp.transform, device=d), wp.array(q, dtype=wp.float32, device=d)]
+    at = [on_device(pose, wp.transform, d), on_device(q, wp.float32, d)]
     found = touching_links(hand, obj, device_limits(bounds), runs, *at)
     out = ContactTable(
         wp.empty(found.run.shape, dtype=wp.int32, device=d),

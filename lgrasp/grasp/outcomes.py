@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.bounds import ANY_CLOSING, GraspBounds
 from lgrasp.grasp.tables import GraspTable
 
 
@@ -77,6 +77,12 @@ METRICS = (
 _SQUEEZE_BOUNDS = (
     *("min_squeeze_travel", "max_closing_travel", "min_stable_squeeze", "min_epsilon", "min_pregrasp_opening"),
 )
+
+
+def bounds_squeeze(bounds: Any) -> bool:
+    """Whether one of _SQUEEZE_BOUNDS asks for something; ``bounds`` as of :func:`failed_squeeze`."""
+    least = bounds.min_squeeze_travel, bounds.min_stable_squeeze, bounds.min_epsilon, bounds.min_pregrasp_opening
+    return max(least) > 0 or bounds.max_closing_travel < ANY_CLOSING
 
 
 def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:

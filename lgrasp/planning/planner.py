@@ -7,14 +7,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import warp as wp
 
 from lgrasp.errors import ObjectError
-from lgrasp.geometry.poses import device_inverse
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.check import check_grasps
+from lgrasp.grasp.check import ContactTable, check_grasps, compare_grasps
 from lgrasp.grasp.find_contacts import find_contacts
-from lgrasp.grasp.outcomes import REASONS, Outcome, failed_bounds
-from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps
+from lgrasp.grasp.outcomes import REASONS, Outcome, bounds_squeeze, failed_bounds
+from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps, take_rows
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.palm import palm_axis
@@ -22,6 +22,7 @@ from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
+from lgrasp.planning.kernels import invert_poses
 from lgrasp.planning.params import PlanParams
 from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
 from lgrasp.refine.descent import Descent
@@ -136,8 +137,8 @@ class Planner:
             search.run(at, rounds=p.opening)
             start, at = self._finalists(start, at)
             search.run(at, first=p.opening)
-            start, at = self._steadiest(start, at)
-        return self._checked(at, start, p.bounds)
+            return self._steadiest(start, at)
+        return check_grasps(*self._posed(at, p.bounds), p.bounds, index=start)
 
     def _opened(self, search: Descent, points: np.ndarray, first: int) -> tuple[np.ndarray, Hands]:
         """Starts, and open hands that advanced to the surface."""
@@ -156,33 +157,41 @@ class Planner:
         assert self.guesses is not None
         each = self.params.draws
         rows = (starts[:, None] * each + np.arange(each)).reshape(-1)
-        return starts.repeat(each), self._put(device_inverse(self.guesses.pose[rows]), self.guesses.q[rows])
+        return starts.repeat(each), self._inverse(self._put(self.guesses.pose[rows], self.guesses.q[rows]))
 
     def _finalists(self, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
         """The best hands of each start after the first matchings."""
         p = self.params
         if np.bincount(start).max() <= p.finalists:
             return start, at
-        _, place, _ = self._ranked(start, at, _loosened(p.bounds))
-        return self._only(np.flatnonzero(place < p.finalists), start, at)
+        place, _ = self._ranked(start, at, _loosened(p.bounds))
+        rows = np.flatnonzero(place < p.finalists)
+        return start[rows], at.taken(rows)
 
-    def _steadiest(self, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
-        """One hand of each start: of those tried the one that holds most often, then the one that resists most."""
-        table, place, passed = self._ranked(start, at, self.params.bounds)
-        held = self._held(table, np.where(passed, place, self._trials[0]))
-        order = np.lexsort([place, -held, start])
-        first = np.flatnonzero(np.diff(start[order], prepend=-1))
-        return self._only(np.sort(order[first]), start, at)
+    def _steadiest(self, start: np.ndarray, at: Hands) -> tuple[GraspTable, np.ndarray]:
+        """One hand of each start, and its outcome: of those tried the one that holds most often, then the one that
+        resists most."""
+        bounds, tried = self.params.bounds, self._trials[0]
+        place, passed = self._ranked(start, at, bounds)
+        # what control poses show may fail any of them
+        rows = np.flatnonzero((place < max(tried, 1)) | (passed if bounds_squeeze(bounds) else False))
+        start, place, passed = start[rows], place[rows], passed[rows]
+        table, outcome = check_grasps(*self._posed(at.taken(rows), bounds), bounds, around=self._scene.around, index=start)
+        held = self._held(table, np.where(passed, place, tried))
+        order = np.lexsort([place, -held, outcome != Outcome.KEPT, start])
+        best = np.sort(order[np.flatnonzero(np.diff(start[order], prepend=-1))])
+        return take_rows(table, best), outcome[best]
 
-    def _ranked(self, start: np.ndarray, at: Hands, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray, np.ndarray]:
-        """All hands, the place of each among those of its start (those that pass the checks first, then those that
-        resist most), and which pass."""
-        table, outcome = self._checked(at, start, bounds.changed(friction=self.params.rank_friction))
+    def _ranked(self, start: np.ndarray, at: Hands, bounds: GraspBounds) -> tuple[np.ndarray, np.ndarray]:
+        """The place of each hand among those of its start (those that pass the checks first, then those that resist
+        most), and which pass."""
+        bounds = bounds.changed(friction=self.params.rank_friction)
+        outcome, load = compare_grasps(*self._posed(at, bounds), bounds, around=self._scene.around)
         passed = outcome == Outcome.KEPT
-        order = np.lexsort([-table.metrics["epsilon"], table.metrics["unresisted_load"], ~passed, start])
+        order = np.argsort(4 * start.astype(float) + 2 * ~passed + load, kind="stable")  # loads are 1 at most
         place = np.empty(len(start), int)
         place[order] = np.arange(len(start)) - np.searchsorted(start[order], start[order])
-        return table, place, passed
+        return place, passed
 
     def _held(self, table: GraspTable, place: np.ndarray) -> np.ndarray:
         """Share of the trials in which each hand holds, (M,): of each start those at the first places are tried, until
@@ -204,10 +213,6 @@ class Planner:
     def _trials(self) -> tuple[int, HoldTest]:
         return self.params.trials(drawn=self.guesses is not None)
 
-    def _only(self, rows: np.ndarray, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
-        pose, q = at.arrays()
-        return start[rows], self._put(pose[rows], q[rows])
-
     def _starts(self, points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Start of each hand (M,), the hands' bases (M, 7) and joints (M, K), and the directions they face (M, 3).
 
@@ -227,11 +232,17 @@ class Planner:
     def _put(self, pose: np.ndarray, q: np.ndarray) -> Hands:
         return Hands.put(pose, q, self.hand.device)
 
-    def _checked(self, at: Hands, start: np.ndarray, bounds: GraspBounds) -> tuple[GraspTable, np.ndarray]:
-        pose, q = at.arrays()
-        back, obj = device_inverse(pose), self._scene.object
-        contacts = find_contacts(self.hand, obj, back, q, bounds, self.palmar)
-        return check_grasps(self.hand, obj, back, q, contacts, bounds, around=self._scene.around, index=start)
+    def _inverse(self, at: Hands) -> Hands:
+        """The same with the other pose: of the hand before the object, or of the object before the hand."""
+        back = wp.empty_like(at.pose)
+        wp.launch(invert_poses, len(back), [at.pose], [back], device=self.hand.device)
+        return Hands(back, at.q)
+
+    def _posed(self, at: Hands, bounds: GraspBounds) -> tuple[HandArrays, ObjectArrays, wp.array, wp.array, ContactTable]:
+        """What a check takes of hands."""
+        held, obj = self._inverse(at), self._scene.object
+        contacts = find_contacts(self.hand, obj, held.pose, held.q, bounds, self.palmar)
+        return self.hand, obj, held.pose, held.q, contacts
 
 
 @dataclass(frozen=True)

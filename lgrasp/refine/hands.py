@@ -23,6 +23,11 @@ class Hands:
         poses = wp.array(pose, dtype=wp.transform, device=device)
         return cls(poses, wp.array(q, dtype=wp.float32, device=device))
 
+    def taken(self, rows: np.ndarray) -> "Hands":
+        """Some of them, by index; copied on the device."""
+        chosen = wp.array(rows, dtype=wp.int32, device=self.q.device)
+        return Hands(wp.indexedarray(self.pose, [chosen]).contiguous(), wp.indexedarray(self.q, [chosen, None]).contiguous())
+
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """Base (N, 7) and joint positions (N, K)."""
         return to_numpy(self.pose).reshape(-1, 7), to_numpy(self.q)

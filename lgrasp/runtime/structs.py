@@ -1,4 +1,4 @@
-"""Warp structs: filled from objects with the same names, or copied to a device from NumPy arrays."""
+"""Warp structs: filled from objects with the same names, or copied to a device from NumPy arrays; and single arrays."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -51,3 +51,8 @@ def empty_arrays(kind: Any, device: str, *shape: int, **given: Any) -> dict[str,
 def empty_struct(kind: Any, device: str, *shape: int, **given: Any) -> Any:
     """A Warp struct of :func:`empty_arrays`."""
     return make_struct(kind, **empty_arrays(kind, device, *shape, **given))
+
+
+def on_device(values: np.ndarray | wp.array, dtype: Any, device: str) -> wp.array:
+    """Values as an array of a device; copied unless they are one."""
+    return values if isinstance(values, wp.array) else wp.array(values, dtype=dtype, device=device)

@@ -149,6 +149,22 @@ class StepSampler:
             steps: of the sampling.
             pool: threads that work on batches on a CPU.
         """
+        R, t, q = self.motions(hands, space, free, each=each, seed=seed, steps=steps, pool=pool)
+        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), q.cpu().numpy())
+
+    @torch.no_grad()
+    def motions(
+        self,
+        hands: HeldHands,
+        space: np.ndarray,
+        free: np.ndarray,
+        *,
+        each: int,
+        seed: int,
+        steps: int,
+        pool: Executor | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """The same on the device: R (N, 3, 3), t (N, 3) [m] and joints (N, K)."""
         rows, joints = hands.q.shape
         number = hands.pose.shape[1]
         start, held = self._put(hands.q), self._held(hands, number)
@@ -162,7 +178,7 @@ class StepSampler:
         )
         count = rows * each
 
-        def work(picked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        def work(picked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
             picked = picked.to(self._device)
             row, own_seed = picked // each, seed * each + picked
             own = (uniforms(own_seed, 1, 1)[:, 0] * _TURNS).long()
@@ -170,12 +186,11 @@ class StepSampler:
             objects = torch.full_like(row, number), HeldObjects(*(x[row] for x in held))
             given = normals(own_seed, 0, 9 + joints).float(), self._turns[own]
             with _short_products(self._device):
-                R, t, q = draw_steps(self._net, self._process, self._senses, seen, *given, *objects, steps)
-            return pose_from_motion(R, t), q
+                return draw_steps(self._net, self._process, self._senses, seen, *given, *objects, steps)
 
         parts = _in_threads(work, _batches(count, self._device), pool if self._device.type == "cpu" else None)
-        pose, q = (torch.cat(x)[:count].cpu().numpy() for x in zip(*parts, strict=True))
-        return DrawnSteps(pose, q)
+        R, t, q = (torch.cat(x)[:count] for x in zip(*parts, strict=True))
+        return R, t, q
 
     def warm(self, rows: int, each: int) -> None:
         """Draw as for ``rows`` hands, empty ones and those that hold something: a GPU loads what it runs when it first

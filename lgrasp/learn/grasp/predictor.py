@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from lgrasp.cloud.model import completed_object
-from lgrasp.geometry.rotations import motion_from_pose, pose_from_motion
+from lgrasp.geometry.rotations import pose_from_motion
 from lgrasp.grasp.sequences import HeldHands
 from lgrasp.hand.tree import Tree
 from lgrasp.learn.diffuser.sampler import DrawnSteps, StepSampler
@@ -49,8 +49,8 @@ class CloudCompletion:
         Args:
             thicker: how far these are moved outward [m].
         """
-        reach = float(np.abs(self.view.t).max() - np.sqrt(3) * self.grid.origin[0])
-        return completed_object(model, lambda x: self.distance(x) - thicker, reach)
+        nodes = np.argwhere(self.grid.values < thicker) * self.grid.cell + self.grid.origin
+        return completed_object(model, lambda x: self.distance(x) - thicker, nodes @ self.view.R.T + self.view.t)
 
 
 class GraspPredictor(CloudCompletion):
@@ -74,11 +74,11 @@ class GraspPredictor(CloudCompletion):
             np.zeros((1, len(tree.joint_open)), bool),
             np.zeros((1, 0, 7), np.float32),
         )
-        drawn = self._sampler.draw(hands, np.zeros(1, int), ~hands.used, each=count, seed=seed, steps=steps)
-        R, t = motion_from_pose(torch.as_tensor(drawn.pose))
-        R = R @ torch.as_tensor(self.view.R, dtype=torch.float32).mT
-        t = t - R @ torch.as_tensor(self.view.t, dtype=torch.float32)
-        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), drawn.q)
+        R, t, q = self._sampler.motions(hands, np.zeros(1, int), ~hands.used, each=count, seed=seed, steps=steps)
+        view_R, view_t = (torch.as_tensor(x, dtype=torch.float32, device=R.device) for x in (self.view.R, self.view.t))
+        R = R @ view_R.mT
+        t = t - R @ view_t
+        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), q.cpu().numpy())
 
     @cached_property
     def _sampler(self) -> StepSampler:
