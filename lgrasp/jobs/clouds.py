@@ -16,7 +16,7 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.scenes.files import scene_cloud
 
-VERSION = 2
+VERSION = 3
 """Raised whenever :func:`whole_object` changes for the same arguments."""
 
 

@@ -144,6 +144,7 @@ class Descent:
             "contacts": (self.params.contacts, wp.int32),
             "deep": (links * DEEPEST, wp.vec3),
             "deep_plane": (links * DEEPEST, wp.vec4),
+            "link_pair": (pairs, wp.int32),
             "link_deep": (pairs * LINK_DEEPEST, wp.vec3),
             "link_plane": (pairs * LINK_DEEPEST, wp.vec4),
         }
@@ -173,7 +174,7 @@ class Descent:
         lanes = lanes_of(d)
         inputs = [points, near, p.contacts, lanes, body, m]
         wp.launch(choose_contacts, dim=(rows, lanes), inputs=inputs, device=d, block_dim=LANES)
-        wp.launch(match_links, dim=(solids.pairs.shape[0], rows), inputs=[solids, p.margin, body, m], device=d)
+        wp.launch(match_links, dim=(rows, lanes), inputs=[solids, p.margin, lanes, body, m], device=d, block_dim=LANES)
 
     def _match_object(self, m: "Correspondences", body: wp.array, reach: float) -> None:
         p, t, d, rows = self.params, self._target, self.device, body.shape[0]

@@ -10,8 +10,8 @@ import warp as wp
 
 from lgrasp.grasp.collision import plane_height
 from lgrasp.math.kinematics import Kinematics
-from lgrasp.math.lanes import lanes_least, lanes_sum, meet
-from lgrasp.refine.match_kernels import Correspondences, Points, Solids
+from lgrasp.math.lanes import lanes_least, lanes_sum, meet, neighbours_sum
+from lgrasp.refine.match_kernels import LINK_DEEPEST, Correspondences, Points, Solids
 from lgrasp.refine.params import LENGTH, STEEPEST
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -21,6 +21,7 @@ wp.set_module_options(KERNEL_OPTIONS)
 MAX_COLUMNS = 32
 """Most joints that a hand's postures name."""
 
+_BLOCK_LANES, _LINK_LANES = wp.constant(8), wp.constant(4)  # that work on one block of points, one link
 _LOG_STEEPEST = math.log(STEEPEST)
 _PARABOLA_SLOPE = wp.constant(-2 * (STEEPEST - 1) * _LOG_STEEPEST - (STEEPEST - 1) ** 2 / STEEPEST)
 _PARABOLA_CONSTANT = wp.constant(-2 * _LOG_STEEPEST - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2)
@@ -122,31 +123,39 @@ def _normal(plane: wp.vec4):
 @wp.func
 def point_pulls(points: Points, s: Search, m: Correspondences, row: wp.int32, w: DescentScratch):
     """Of the planes that points are drawn to and kept beyond: a part for each block."""
-    for block in range(w.lane, points.body.shape[0], w.lanes):
-        b = points.body[block]
-        R = wp.quat_to_matrix(wp.transform_get_rotation(w.X[b]))
-        t = wp.transform_get_translation(w.X[b])
+    side = wp.min(w.lanes, _BLOCK_LANES)
+    for start in range(0, points.body.shape[0], w.lanes // side):
+        block = start + w.lane // side
+        b = int(0)
         total = wp.vec3()
         moment = wp.vec3()
-        for i in range(block * points.block, (block + 1) * points.block):
-            x = R * points.points[i] + t
-            wall = m.block[row, i]
-            f = wp.vec3()
-            u = plane_height(wall, x) / s.margin
-            if u < 1.0:
-                f = _normal(wall) * (s.barrier * _repulsion(u) / s.margin)
-            pull = m.pull[row, i]
-            if pull > 0.0:
-                plane = m.plane[row, i]
-                n = _normal(plane)
-                f += n * (2.0 * s.points * pull * plane_height(plane, x) / (LENGTH * LENGTH))
-                own = R * points.normals[i]
-                moment += wp.cross(own, n) * (2.0 * s.normals * pull * (wp.dot(own, n) + 1.0))
-            total += f
-            moment += wp.cross(x, f)
-        w.part_body[block] = b
-        w.part_force[block] = total
-        w.part_moment[block] = moment
+        if block < points.body.shape[0]:
+            b = points.body[block]
+            R = wp.quat_to_matrix(wp.transform_get_rotation(w.X[b]))
+            t = wp.transform_get_translation(w.X[b])
+            for i in range(block * points.block + w.lane % side, (block + 1) * points.block, side):
+                x = R * points.points[i] + t
+                wall = m.block[row, i]
+                f = wp.vec3()
+                u = plane_height(wall, x) / s.margin
+                if u < 1.0:
+                    f = _normal(wall) * (s.barrier * _repulsion(u) / s.margin)
+                pull = m.pull[row, i]
+                if pull > 0.0:
+                    plane = m.plane[row, i]
+                    n = _normal(plane)
+                    f += n * (2.0 * s.points * pull * plane_height(plane, x) / (LENGTH * LENGTH))
+                    own = R * points.normals[i]
+                    moment += wp.cross(own, n) * (2.0 * s.normals * pull * (wp.dot(own, n) + 1.0))
+                total += f
+                moment += wp.cross(x, f)
+        for e in range(3):
+            total[e] = neighbours_sum(total[e], side)
+            moment[e] = neighbours_sum(moment[e], side)
+        if block < points.body.shape[0] and w.lane % side == 0:
+            w.part_body[block] = b
+            w.part_force[block] = total
+            w.part_moment[block] = moment
 
 
 @wp.func
@@ -181,21 +190,29 @@ def wrench_pulls(
 def solid_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, first: wp.int32, w: DescentScratch):
     """Of the object's points that links are kept off: a part for each link, from ``first`` on."""
     each = m.deep.shape[1] // solids.body.shape[0]
-    for link in range(w.lane, solids.body.shape[0], w.lanes):
-        b = solids.body[link]
+    side = wp.min(w.lanes, _LINK_LANES)
+    for start in range(0, solids.body.shape[0], w.lanes // side):
+        link = start + w.lane // side
+        b = int(0)
         total = wp.vec3()
         moment = wp.vec3()
-        for i in range(link * each, (link + 1) * each):
-            plane = m.deep_plane[row, i]
-            x = m.deep[row, i]
-            u = plane_height(plane, wp.transform_point(wp.transform_inverse(w.X[b]), x)) / s.margin
-            if u < 1.0:
-                f = wp.transform_vector(w.X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.margin)
-                total -= f
-                moment -= wp.cross(x, f)
-        w.part_body[first + link] = b
-        w.part_force[first + link] = total
-        w.part_moment[first + link] = moment
+        if link < solids.body.shape[0]:
+            b = solids.body[link]
+            for i in range(link * each + w.lane % side, (link + 1) * each, side):
+                plane = m.deep_plane[row, i]
+                x = m.deep[row, i]
+                u = plane_height(plane, wp.transform_point(wp.transform_inverse(w.X[b]), x)) / s.margin
+                if u < 1.0:
+                    f = wp.transform_vector(w.X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.margin)
+                    total -= f
+                    moment -= wp.cross(x, f)
+        for e in range(3):
+            total[e] = neighbours_sum(total[e], side)
+            moment[e] = neighbours_sum(moment[e], side)
+        if link < solids.body.shape[0] and w.lane % side == 0:
+            w.part_body[first + link] = b
+            w.part_force[first + link] = total
+            w.part_moment[first + link] = moment
 
 
 @wp.func
@@ -215,8 +232,7 @@ def gather_parts(count: wp.int32, bodies: wp.int32, w: DescentScratch):
 @wp.func
 def link_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, w: DescentScratch):
     """Of other links' points that links are kept off, added to the bodies; few are near enough."""
-    pairs = solids.pairs.shape[0]
-    count = m.link_plane.shape[1]
+    count = m.links[row] * LINK_DEEPEST
     for start in range(0, count, w.lanes):
         i = start + w.lane
         near = int(0)
@@ -226,15 +242,14 @@ def link_pulls(solids: Solids, s: Search, m: Correspondences, row: wp.int32, w: 
         x = wp.vec3()
         if i < count:
             plane = m.link_plane[row, i]
-            if wp.length_sq(_normal(plane)) > 0.0:
-                pair = solids.pairs[i * pairs // count]
-                a = solids.body[pair[0]]
-                b = solids.body[pair[1]]
-                x = wp.transform_point(w.X[a], m.link_deep[row, i])
-                u = plane_height(plane, wp.transform_point(wp.transform_inverse(w.X[b]), x)) / s.link_margin
-                if u < 1.0:
-                    near = 1
-                    f = wp.transform_vector(w.X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.link_margin)
+            pair = solids.pairs[m.link_pair[row, i // LINK_DEEPEST]]
+            a = solids.body[pair[0]]
+            b = solids.body[pair[1]]
+            x = wp.transform_point(w.X[a], m.link_deep[row, i])
+            u = plane_height(plane, wp.transform_point(wp.transform_inverse(w.X[b]), x)) / s.link_margin
+            if u < 1.0:
+                near = 1
+                f = wp.transform_vector(w.X[b], _normal(plane)) * (s.barrier * _repulsion(u) / s.link_margin)
         if lanes_least(-near) < 0:
             for turn in range(w.lanes):
                 if turn == w.lane and near == 1:

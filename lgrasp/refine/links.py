@@ -90,6 +90,8 @@ class LinkSolids:
         p = (link_R[row, first, None] @ self._points[first][..., None])[..., 0] + link_t[row, first, None]
         p = _into(link_R[row, second, None], link_t[row, second, None], p)  # (E, probes, 3)
         d, _ = self._distance(p, second[:, None])
+        near = d.amin(1) < self._margin
+        row, pair, first, second, p, d = (x[near] for x in (row, pair, first, second, p, d))
         best = d.topk(LINK_DEEPEST, dim=1, largest=False).indices
         normal, offset = self._planes(p.gather(1, best[..., None].expand(-1, -1, 3)), second[:, None])
         shape = (len(centre), len(a), LINK_DEEPEST)

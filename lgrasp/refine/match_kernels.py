@@ -6,9 +6,9 @@ Rows are hands; everything is frozen until it is matched again (:mod:`lgrasp.ref
 import warp as wp
 
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
-from lgrasp.math.lanes import lanes_least, lanes_max, lanes_sum, meet
+from lgrasp.math.lanes import lanes_before, lanes_count, lanes_least, lanes_max, lanes_sum, meet
 from lgrasp.math.limits import MAX_JOINTS
-from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_part, sdf_value
+from lgrasp.math.sdf import Sdf, sdf_far, sdf_gradient, sdf_part, sdf_value
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -65,6 +65,8 @@ class Correspondences:
     contacts: wp.array2d(dtype=wp.int32)  # (N, contacts) points that make the net wrench
     deep: wp.array2d(dtype=wp.vec3)  # (N, S * DEEPEST) points of the object, its frame [m]
     deep_plane: wp.array2d(dtype=wp.vec4)  # (N, S * DEEPEST) of the link, body's frame
+    links: wp.array(dtype=wp.int32)  # (N,) pairs of links that are near each other, the first ones of the next
+    link_pair: wp.array2d(dtype=wp.int32)  # (N, Q)
     link_deep: wp.array2d(dtype=wp.vec3)  # (N, Q * LINK_DEEPEST) points of links, their bodies' frames [m]
     link_plane: wp.array2d(dtype=wp.vec4)  # (N, Q * LINK_DEEPEST) of the other link, its body's frame
 
@@ -181,8 +183,11 @@ def choose_contacts(
         for k in range(lane, points.palmar.shape[0], lanes):
             if m.distance[row, points.palmar[k]] <= middle:
                 within += 1.0
-        if lanes_sum(within) >= float(nearest):
+        count_within = lanes_sum(within)
+        if count_within >= float(nearest):
             high = middle
+            if count_within == float(nearest):
+                break
         else:
             low = middle
     chosen = best
@@ -249,16 +254,18 @@ def match_solids(
     which = _veci_deep(0)
     for k in range(cloud.shape[0]):
         if wp.length_sq(cloud[k] - centre) < radius * radius:
-            d = sdf_value(grid, wp.transform_point(back, cloud[k]))
-            at = k
-            for e in range(DEEPEST):
-                if d < depth[e]:
-                    later = depth[e]
-                    later_at = which[e]
-                    depth[e] = d
-                    which[e] = at
-                    d = later
-                    at = later_at
+            x = wp.transform_point(back, cloud[k])
+            if not sdf_far(grid, x, depth[DEEPEST - 1]):
+                d = sdf_value(grid, x)
+                at = k
+                for e in range(DEEPEST):
+                    if d < depth[e]:
+                        later = depth[e]
+                        later_at = which[e]
+                        depth[e] = d
+                        which[e] = at
+                        d = later
+                        at = later_at
     for e in range(DEEPEST):
         plane = wp.vec4(0.0, 0.0, 0.0, NO_PLANE)
         if depth[e] < _FAR_DISTANCE:
@@ -268,36 +275,66 @@ def match_solids(
 
 
 @wp.kernel
-def match_links(s: Solids, margin: wp.float32, body: wp.array2d(dtype=wp.transform), m: Correspondences):
-    """The deepest points of the first link of each pair in the second; launched over (pair, hand).
+def match_links(
+    s: Solids, margin: wp.float32, lanes: wp.int32, body: wp.array2d(dtype=wp.transform), m: Correspondences
+):
+    """The deepest points of the first link of each pair in the second, where they are near; over hands and lanes.
 
     Args:
         body: T_object_body, (N, B).
     """
-    pair, row = wp.tid()
-    a = s.pairs[pair][0]
-    b = s.pairs[pair][1]
-    A = body[row, s.body[a]]
-    B = body[row, s.body[b]]
-    first = pair * LINK_DEEPEST
-    for e in range(LINK_DEEPEST):
-        m.link_plane[row, first + e] = wp.vec4(0.0, 0.0, 0.0, NO_PLANE)
-    reach = s.ball[a][3] + s.ball[b][3] + margin
-    if wp.length_sq(_centre(s, a, A) - _centre(s, b, B)) >= reach * reach:
-        return
-    T = wp.transform_inverse(B) * A
-    grid = _grid(s, b)
-    depth = wp.vec2(_FAR_DISTANCE, _FAR_DISTANCE)
-    which = wp.vec2i(0, 0)
-    for k in range(s.points.shape[1]):
-        d = sdf_value(grid, wp.transform_point(T, s.points[a, k]))
-        if d < depth[0]:
-            depth = wp.vec2(d, depth[0])
-            which = wp.vec2i(k, which[0])
-        elif d < depth[1]:
-            depth[1] = d
-            which[1] = k
-    for e in range(LINK_DEEPEST):
-        p = s.points[a, which[e]]
-        m.link_deep[row, first + e] = p
-        m.link_plane[row, first + e] = _link_plane(grid, wp.transform_point(T, p))
+    row, lane = wp.tid()
+    pairs = s.pairs.shape[0]
+    near = int(0)
+    for start in range(0, pairs, lanes):
+        pair = start + lane
+        meets = int(0)
+        if pair < pairs:
+            a = s.pairs[pair][0]
+            b = s.pairs[pair][1]
+            B = body[row, s.body[b]]
+            centre = _centre(s, a, body[row, s.body[a]])
+            reach = s.ball[a][3] + s.ball[b][3] + margin
+            if wp.length_sq(centre - _centre(s, b, B)) < reach * reach:
+                inside = wp.transform_point(wp.transform_inverse(B), centre)
+                if not sdf_far(_grid(s, b), inside, s.ball[a][3] + margin):
+                    meets = 1
+        place = near + lanes_before(meets)
+        if meets == 1:
+            m.link_pair[row, place] = pair
+        near += lanes_count(meets)
+    meet()
+    kept = int(0)
+    for n in range(near):
+        pair = m.link_pair[row, n]
+        a = s.pairs[pair][0]
+        b = s.pairs[pair][1]
+        T = wp.transform_inverse(body[row, s.body[b]]) * body[row, s.body[a]]
+        grid = _grid(s, b)
+        depth = wp.vec2(_FAR_DISTANCE, _FAR_DISTANCE)
+        which = wp.vec2i(_NONE, _NONE)
+        for k in range(lane, s.points.shape[1], lanes):
+            d = sdf_value(grid, wp.transform_point(T, s.points[a, k]))
+            if d < depth[0]:
+                depth = wp.vec2(d, depth[0])
+                which = wp.vec2i(k, which[0])
+            elif d < depth[1]:
+                depth[1] = d
+                which[1] = k
+        deepest = -lanes_max(-depth[0])
+        first = lanes_least(wp.where(depth[0] == deepest, which[0], _NONE))
+        if first == which[0]:
+            depth[0] = depth[1]
+            which[0] = which[1]
+        after = -lanes_max(-depth[0])
+        second = lanes_least(wp.where(depth[0] == after, which[0], _NONE))
+        if deepest < margin:
+            for e in range(lane, LINK_DEEPEST, lanes):
+                p = s.points[a, wp.where(e == 0, first, second)]
+                m.link_deep[row, kept * LINK_DEEPEST + e] = p
+                m.link_plane[row, kept * LINK_DEEPEST + e] = _link_plane(grid, wp.transform_point(T, p))
+            if lane == 0:
+                m.link_pair[row, kept] = pair
+            kept += 1
+    if lane == 0:
+        m.links[row] = kept

@@ -17,6 +17,7 @@ _ONE_SIDED = 0.35  # length of the mean normal above which a cloud shows one sid
 _RIM = 0.02  # share of the points that lie beyond the rim
 _BLOCK = 1 << 25  # distances at a time
 _AT_ONCE = 16  # clouds
+_DIAGONAL = 3**0.5  # of a cell, over its side
 
 
 class Cubes(NamedTuple):
@@ -123,7 +124,16 @@ def completed_grids(net: CompletionNet, points: torch.Tensor, normals: torch.Ten
     grids = []
     for some in torch.arange(len(points), device=points.device).split(_AT_ONCE):
         cubes = cubes_of(points[some], normals[some], count)
-        values = (net(cubes) * cubes.half[:, None, None, None]).cpu().numpy()
+        values = net(cubes) * cubes.half[:, None, None, None]
+        values = without_specks(values, 2 * cubes.half / (count - 1)).cpu().numpy()
         for h, value in zip(cubes.half.tolist(), values, strict=True):
             grids.append(SdfGrid(value.astype(np.float32), np.full(3, -h, np.float32), 2 * h / (count - 1)))
     return grids
+
+
+def without_specks(values: torch.Tensor, cell: torch.Tensor) -> torch.Tensor:
+    """Distances (N, n, n, n) [m] on grids of spacing cell (N,) [m]: what differs from the median of the nodes about it
+    by more than distances can is that median. A network guesses the inside here and there where it is far."""
+    padded = functional.pad(values[:, None], (1,) * 6, mode="replicate")[:, 0]
+    about = padded.unfold(1, 3, 1).unfold(2, 3, 1).unfold(3, 3, 1).flatten(4).median(4).values
+    return torch.where((values - about).abs() > _DIAGONAL * cell[:, None, None, None], about, values)
