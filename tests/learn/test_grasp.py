@@ -11,7 +11,7 @@ from lgrasp.geometry.poses import device_matrix
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.learn.diffuser.examples import make_net
 from lgrasp.learn.diffuser.senses import coarse_grid
-from lgrasp.learn.grasp.completion import CompletionNet
+from lgrasp.learn.grasp.completion import CompletionNet, unit_nodes, without_specks
 from lgrasp.learn.grasp.completion_training import ViewSet, fit_completion
 from lgrasp.learn.grasp.examples import first_steps, grasp_examples
 from lgrasp.learn.grasp.file import Networks, load_networks, predictor_bytes
@@ -92,6 +92,20 @@ def test_what_was_seen_stays_and_the_rest_is_closed(inputs, networks, half):
     assert whole.contact_points[:, 2].min() + seen.center[2] < -0.01
     alone = sample_sdf(seen.grid, np.array([[0, 0, -0.01]]) - seen.center)
     assert alone[0] > 0
+
+
+def test_specks_of_inside_far_off_are_no_object():
+    n, half = 16, torch.tensor([0.1, 0.05])
+    nodes = unit_nodes(n, half.device).reshape(n, n, n, 3) * half[:, None, None, None, None]
+    true = nodes.norm(dim=-1) - 0.4 * half[:, None, None, None]
+    guessed = true.clone()
+    for at in ((0, 0, 0), (15, 8, 15), (2, 13, 3)):
+        guessed[:, *at] = -0.02
+    cell = 2 * half / (n - 1)
+    torch.testing.assert_close(without_specks(true, cell), true)
+    found = without_specks(guessed, cell)
+    assert ((found < 0) == (true < 0)).all()
+    torch.testing.assert_close(found[true.abs() < 0.02], true[true.abs() < 0.02])
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lgrasp.cloud.model import cloud_object
-from lgrasp.grasp.check import check_grasps, known_contacts
+from lgrasp.grasp.check import check_grasps, compare_grasps, known_contacts
 from lgrasp.grasp.outcomes import REASONS, Outcome
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hold.params import HoldTest
@@ -54,6 +54,27 @@ def test_every_plan_passes_the_check_with_the_contacts_stored(planner, planned, 
     np.testing.assert_array_equal(every.q[every.metrics["valid"] == 1], table.q)
 
 
+def test_hands_are_compared_by_what_the_check_finds(planner, inputs):
+    table = planner.run(8, keep_invalid=True).grasps
+    contacts = known_contacts(table.contact_links, table.contact_points, table.contact_normals, "cpu")
+    hands = inputs.hand, inputs.object, table.pose, table.q, contacts, QUICK.bounds
+    whole, outcome = check_grasps(*hands)
+    compared, load = compare_grasps(*hands)
+    np.testing.assert_array_equal(compared, outcome)
+    np.testing.assert_array_equal(load, whole.metrics["unresisted_load"])
+    assert len(set(outcome.tolist())) > 1
+
+
+def test_where_control_poses_are_bounded_the_best_that_meets_them_is_the_plan(inputs):
+    """Of those compared first many fail what only control poses show."""
+    params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": 0})
+    least = float(np.median(Planner(inputs.hand, inputs.object.model, 0.12, params).run(20).grasps.metrics["epsilon"]))
+    bounded = params.model_copy(update={"bounds": params.bounds.changed(min_epsilon=least)})
+    table = Planner(inputs.hand, inputs.object.model, 0.12, bounded).run(20).grasps
+    assert len(table) > 10
+    assert table.metrics["epsilon"].min() >= least
+
+
 def test_a_start_does_not_depend_on_the_others(planner, planned):
     few = planner.run(4)
     same = planned.grasps.index < 4
@@ -69,8 +90,7 @@ def plan(inputs) -> Callable[..., GraspTable]:
     @cache
     def plan(tried: int, draws: int = 0) -> GraspTable:
         several = {"rolls": 12, "finalists": 12, "tried": tried, "hold": HoldTest(draws=draws)}
-        alike = {"rank_friction": QUICK.bounds.friction}  # hands are tried as they will be plans
-        params = QUICK.model_copy(update=several | alike)
+        params = QUICK.model_copy(update=several)
         return Planner(inputs.hand, inputs.object.model, 0.12, params).run(60).grasps
 
     return plan
