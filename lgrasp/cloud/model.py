@@ -257,10 +257,11 @@ def _heights(
     """Signed distances of nodes from planes through points, however deep, and distances from the nearest point [m]."""
     gap, near = tree.query(nodes, min(_PLANES, len(points)), workers=-1)
     weight = np.exp(-0.5 * (gap / (gap[:, :1] + cell)) ** 2)
-    height = ((nodes[:, None] - points[near]) * normals[near]).sum(-1)
+    facing = normals[near]
+    height = np.einsum("nki,ni->nk", facing, nodes) - np.einsum("ni,ni->n", points, normals)[near]
     plane = (weight * height).sum(1) / weight.sum(1)
     # about an edge what is outside one of its faces is outside
-    edge = np.einsum("nki,ni->nk", normals[near], normals[near[:, 0]]).min(1) < _EDGE
+    edge = np.einsum("nki,ni->nk", facing, facing[:, 0]).min(1) < _EDGE
     plane = np.where(edge, height.max(1), plane)
     # close to the surface the planes tell the distance, farther off the nearest point does
     spacing = float(np.median(tree.query(points, 2)[0][:, 1]))

@@ -134,6 +134,15 @@ def completed_grids(net: CompletionNet, points: torch.Tensor, normals: torch.Ten
 def without_specks(values: torch.Tensor, cell: torch.Tensor) -> torch.Tensor:
     """Distances (N, n, n, n) [m] on grids of spacing cell (N,) [m]: what differs from the median of the nodes about it
     by more than distances can is that median. A network guesses the inside here and there where it is far."""
-    padded = functional.pad(values[:, None], (1,) * 6, mode="replicate")[:, 0]
-    about = padded.unfold(1, 3, 1).unfold(2, 3, 1).unfold(3, 3, 1).flatten(4).median(4).values
-    return torch.where((values - about).abs() > _DIAGONAL * cell[:, None, None, None], about, values)
+    h, steep = cell[:, None, None, None], torch.zeros_like(values, dtype=torch.bool)
+    for axis in (1, 2, 3):
+        jump = values.diff(dim=axis).abs() > h
+        steep.narrow(axis, 0, jump.shape[axis]).logical_or_(jump)
+        steep.narrow(axis, 1, jump.shape[axis]).logical_or_(jump)
+    row, *node = (x[:, None] for x in steep.nonzero().unbind(1))  # few
+    step = torch.cartesian_prod(*3 * [torch.arange(-1, 2, device=values.device)])
+    about = [(x + d).clamp(0, values.shape[1] - 1) for x, d in zip(node, step.T, strict=True)]
+    middle = values[row, *about].median(1).values
+    out = values.clone()
+    out[steep] = torch.where((out[steep] - middle).abs() > _DIAGONAL * cell[row[:, 0]], middle, out[steep])
+    return out
