@@ -134,5 +134,11 @@ class Senses:
 
     def _distance(self, x: torch.Tensor, R: torch.Tensor, t: torch.Tensor, object: torch.Tensor) -> torch.Tensor:
         """Signed distance [m] of points (N, n, 3) of the hand frame from one object for each row."""
-        u, v, w = ((x - t[:, None]) @ R).unbind(-1)
+        origin, within = -(t[:, None] @ R)[:, 0], []
+        for k in range(3):  # by columns, as in _places
+            at = origin[:, k, None]
+            for component, share in zip(x.unbind(-1), R[:, :, k, None].unbind(1), strict=True):
+                at = torch.addcmul(at, component, share)
+            within.append(at)
+        u, v, w = within
         return self._grids.value_within((u, v, w), object[:, None])
