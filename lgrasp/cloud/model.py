@@ -12,6 +12,8 @@ from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_ord
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.surface import opposite_points, probe_fits
+from lgrasp.runtime.cores import cores
+from lgrasp.runtime.ordered import in_order
 
 TRUST = 0.02
 """Behind what was seen, the sign of distances is known to this depth [m]; what lies deeper counts as neither."""
@@ -25,6 +27,7 @@ _PASSES, _KEPT = 4, 0.95  # over noisy clouds
 _SAME_SIDE = 0.7  # cosine
 _PAD = 0.016
 _MOST_NODES, _LEAST_CELL = 250_000, 0.0015
+_NODES_AT_ONCE = 4096
 _CONTACTS = 4096
 _TRUSTED, _GUESSED = 0.003, 0.009  # [m] from what was seen: its distances hold; they are guessed
 _BOX = (0.01, 0.99)  # shares of the points along an axis
@@ -255,15 +258,22 @@ def _heights(
     nodes: np.ndarray, points: np.ndarray, normals: np.ndarray, tree: cKDTree, cell: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances of nodes from planes through points, however deep, and distances from the nearest point [m]."""
-    gap, near = tree.query(nodes, min(_PLANES, len(points)), workers=-1)
-    weight = np.exp(-0.5 * (gap / (gap[:, :1] + cell)) ** 2)
-    facing = normals[near]
-    height = np.einsum("nki,ni->nk", facing, nodes) - np.einsum("ni,ni->n", points, normals)[near]
-    plane = (weight * height).sum(1) / weight.sum(1)
-    # about an edge what is outside one of its faces is outside
-    edge = np.einsum("nki,ni->nk", facing, facing[:, 0]).min(1) < _EDGE
-    plane = np.where(edge, height.max(1), plane)
-    # close to the surface the planes tell the distance, farther off the nearest point does
-    spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
-    share = np.clip(gap[:, 0] / max(4 * spacing, 2 * cell) - 0.5, 0, 1)
-    return (1 - share) * plane + share * np.sign(plane) * gap[:, 0], gap[:, 0]
+    height = np.einsum("ni,ni->n", points, normals)
+    spacing = float(np.median(tree.query(points, 2, workers=-1)[0][:, 1]))
+
+    def part(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        gap, near = tree.query(nodes, min(_PLANES, len(points)))
+        weight = np.exp(-0.5 * (gap / (gap[:, :1] + cell)) ** 2)
+        facing = normals[near]
+        above = np.einsum("nki,ni->nk", facing, nodes) - height[near]
+        plane = (weight * above).sum(1) / weight.sum(1)
+        # about an edge what is outside one of its faces is outside
+        edge = np.einsum("nki,ni->nk", facing, facing[:, 0]).min(1) < _EDGE
+        plane = np.where(edge, above.max(1), plane)
+        # close to the surface the planes tell the distance, farther off the nearest point does
+        share = np.clip(gap[:, 0] / max(4 * spacing, 2 * cell) - 0.5, 0, 1)
+        return (1 - share) * plane + share * np.sign(plane) * gap[:, 0], gap[:, 0]
+
+    cuts = [nodes[at : at + _NODES_AT_ONCE] for at in range(0, len(nodes), _NODES_AT_ONCE)]
+    distance, away = zip(*(found for _, found in in_order(part, cuts, cores())), strict=True)
+    return np.concatenate(distance), np.concatenate(away)

@@ -18,6 +18,7 @@ from lgrasp.refine.match_kernels import (
     Correspondences,
     Points,
     Solids,
+    Surroundings,
     choose_contacts,
     match_links,
     match_points,
@@ -179,8 +180,10 @@ class Descent:
     def _match_object(self, m: "Correspondences", body: wp.array, reach: float) -> None:
         p, t, d, rows = self.params, self._target, self.device, body.shape[0]
         points, solids = self._points, self._solids
-        shapes = [points, t.own, t.around, int(t.has_around), p.touching, reach, p.soft, body, m]
-        wp.launch(match_points, dim=(points.body.shape[0], rows), inputs=shapes, device=d)
+        every = make_struct(Surroundings, t, has_around=int(t.has_around))
+        dim, lanes = rows * points.body.shape[0], lanes_of(d)
+        inputs = [points, every, p.touching, reach, p.soft, lanes, body, m]
+        wp.launch(match_points, dim=(dim, lanes), inputs=inputs, device=d, block_dim=LANES)
         inputs = [solids, t.cloud, p.margin, body, m]
         wp.launch(match_solids, dim=(solids.body.shape[0], rows), inputs=inputs, device=d)
 

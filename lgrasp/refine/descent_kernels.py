@@ -21,7 +21,7 @@ from lgrasp.refine.match_kernels import Correspondences, Points, Solids
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
-wp.set_module_options(KERNEL_OPTIONS)
+wp.set_module_options(KERNEL_OPTIONS | {"fast_math": True})
 
 _TINY = wp.constant(1.0e-12)
 _SECOND_MOMENT_DECAY = wp.constant(0.99)  # decay of adam's second moment
@@ -56,16 +56,17 @@ class Moments:
 
 
 @wp.func
-def _moved(moments: Moments, row: wp.int32, k: wp.int32, g: wp.float32, square: wp.float32, step: wp.int32, s: Search):
-    """Share of the largest step, down, of coordinate k: adam's, or that of sgd with momentum."""
+def _moved(moments: Moments, row: wp.int32, k: wp.int32, g: wp.float32, square: wp.float32, known: wp.vec2, s: Search):
+    """Share of the largest step, down, of coordinate k: adam's, or that of sgd with momentum; ``known`` is how much of
+    the means comes from the steps until now."""
     mean = s.momentum * moments.first[row, k] + (1.0 - s.momentum) * g
     moments.first[row, k] = mean
     if s.sgd == 1:
         return -mean
     root = _SECOND_MOMENT_DECAY * moments.second[row, k] + (1.0 - _SECOND_MOMENT_DECAY) * square
     moments.second[row, k] = root
-    mean = mean / (1.0 - wp.pow(s.momentum, float(step)))
-    root = wp.sqrt(root / (1.0 - wp.pow(_SECOND_MOMENT_DECAY, float(step))))
+    mean = mean / known[0]
+    root = wp.sqrt(root / known[1])
     return -wp.clamp(mean / (root + _TINY), -1.0, 1.0)
 
 
@@ -110,7 +111,8 @@ def _step(
 ):
     """Take step k of a hand down the derivatives."""
     centre = wp.transform_point(w.X[0], s.middle)
-    step = schedule.taken + k + 1
+    step = float(schedule.taken + k + 1)
+    known = wp.vec2(1.0 - wp.pow(s.momentum, step), 1.0 - wp.pow(_SECOND_MOMENT_DECAY, step))
     size = wp.pow(s.decay, float(schedule.skipped + schedule.taken + k) / (float(s.gradient_steps) * schedule.whole))
     # one scale for all three coordinates: steps do not depend on the frame
     for e in range(w.lane, 6, w.lanes):
@@ -122,7 +124,7 @@ def _step(
         square = wp.length_sq(g) / 3.0
         if s.sgd == 1:
             g = g / wp.max(wp.length(g), 1.0)
-        w.moved[e] = largest * size * _moved(moments, row, e, g[e % 3], square, step, s)
+        w.moved[e] = largest * size * _moved(moments, row, e, g[e % 3], square, known, s)
     scale = float(1.0)
     if s.sgd == 1:
         norm = float(0.0)
@@ -131,7 +133,7 @@ def _step(
         scale = 1.0 / wp.max(wp.sqrt(lanes_sum(norm)), 1.0)
     for c in range(w.lane, q.shape[1], w.lanes):
         slope = w.by_q[c] * scale
-        x = q[row, c] + s.max_joint_step * size * _moved(moments, row, 6 + c, slope, slope * slope, step, s)
+        x = q[row, c] + s.max_joint_step * size * _moved(moments, row, 6 + c, slope, slope * slope, known, s)
         q[row, c] = wp.clamp(x, s.lower[c], s.upper[c])
     meet()
     if w.lane == 0:
@@ -171,20 +173,20 @@ def descend(
         if lane == 0:
             w.X[0] = pose[row]
         meet()
-        if schedule.gradient == 1:
+        # one place for the gradient: twice its instructions are more than a GPU keeps at hand
+        for k in range(wp.where(schedule.gradient == 1, 1, s.gradient_steps)):
             _gradient(h, parts.points, parts.solids, parts.own, s, m, row, q, w)
-            by_turn = w.M[0] - wp.cross(wp.transform_point(w.X[0], s.middle), w.F[0])
-            for e in range(lane, 3, w.lanes):
-                moments.first[row, e] = w.F[0][e]
-                moments.first[row, 3 + e] = by_turn[e]
-            for c in range(lane, q.shape[1], w.lanes):
-                moments.first[row, 6 + c] = w.by_q[c]
-        else:
-            for k in range(s.gradient_steps):
-                _gradient(h, parts.points, parts.solids, parts.own, s, m, row, q, w)
+            if schedule.gradient == 1:
+                by_turn = w.M[0] - wp.cross(wp.transform_point(w.X[0], s.middle), w.F[0])
+                for e in range(lane, 3, w.lanes):
+                    moments.first[row, e] = w.F[0][e]
+                    moments.first[row, 3 + e] = by_turn[e]
+                for c in range(lane, q.shape[1], w.lanes):
+                    moments.first[row, 6 + c] = w.by_q[c]
+            else:
                 _step(s, schedule, moments, row, k, q, w)
-            if lane == 0:
-                pose[row] = w.X[0]
+        if lane == 0:
+            pose[row] = w.X[0]
         meet()
 
 

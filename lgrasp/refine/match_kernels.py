@@ -101,36 +101,46 @@ def _plane(at: wp.vec4, x: wp.vec3):
     return wp.vec4(at[0], at[1], at[2], at[0] * x[0] + at[1] * x[1] + at[2] * x[2] - at[3])
 
 
+@wp.struct
+class Surroundings:
+    """What hands are drawn to and kept out of."""
+
+    own: Volume
+    around: Volume
+    has_around: wp.int32
+
+
 @wp.kernel
 def match_points(
     points: Points,
-    own: Volume,
-    around: Volume,
-    has_around: wp.int32,
+    solids: Surroundings,
     touching: wp.int32,
     reach: wp.float32,
     soft: wp.float32,
+    lanes: wp.int32,
     body: wp.array2d(dtype=wp.transform),
     m: Correspondences,
 ):
-    """Planes, pulls and distances of points; launched over (block, hand).
+    """Planes, pulls and distances of points; launched over (hand, block) and lanes.
 
     Args:
         body: T_object_body, (N, B).
     """
-    block, row = wp.tid()
+    item, lane = wp.tid()
+    row = item // points.body.shape[0]
+    block = item % points.body.shape[0]
     T = body[row, points.body[block]]
     first = block * points.block
     apart = _vec_block()
-    for k in range(points.block):
+    for k in range(lane, points.block, lanes):
         i = first + k
         x = wp.transform_point(T, points.points[i])
-        at = volume_at(own, x)
+        at = volume_at(solids.own, x)
         m.plane[row, i] = _plane(at, x)
         m.distance[row, i] = at[3]
-        apart[k] = wp.where(points.weight[i] > 0.0, wp.abs(at[3]), _FAR_DISTANCE)
-        if has_around == 1:
-            other = volume_at(around, x)
+        apart[k // lanes] = wp.where(points.weight[i] > 0.0, wp.abs(at[3]), _FAR_DISTANCE)
+        if solids.has_around == 1:
+            other = volume_at(solids.around, x)
             if other[3] < at[3]:
                 at = other
             m.block[row, i] = _plane(at, x)
@@ -138,15 +148,16 @@ def match_points(
     least = float(-1.0)
     for _ in range(touching):
         following = float(_FAR_DISTANCE)
-        for k in range(points.block):
-            if apart[k] > least:
-                following = wp.min(following, apart[k])
-        least = following
-    for k in range(points.block):
+        for k in range(lane, points.block, lanes):
+            if apart[k // lanes] > least:
+                following = wp.min(following, apart[k // lanes])
+        least = -lanes_max(-following)
+    for k in range(lane, points.block, lanes):
         i = first + k
+        near = apart[k // lanes]
         pull = float(0.0)
-        if apart[k] <= least and apart[k] < reach:
-            pull = points.weight[i] / (1.0 + apart[k] / soft)
+        if near <= least and near < reach:
+            pull = points.weight[i] / (1.0 + near / soft)
         m.pull[row, i] = pull
 
 
