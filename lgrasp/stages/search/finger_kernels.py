@@ -16,7 +16,7 @@ from lgrasp.math.limits import MAX_BODIES, MAX_CONTACTS, MAX_JOINTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.search.kernels import hit_at
-from lgrasp.stages.search.sets import Asked, Hits, TriedSets, Usable
+from lgrasp.stages.search.sets import AskedCandidates, Hits, TriedSets, Usable
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -26,7 +26,7 @@ _FIT, _UNFIT = wp.constant(0), wp.constant(1)
 
 
 @wp.kernel
-def list_fingers(hits: Hits, tried: TriedSets, usable_out: Usable, asked_out: Asked):
+def list_fingers(hits: Hits, tried: TriedSets, usable_out: Usable, asked_out: AskedCandidates):
     """One thread per (group, hit): candidates that nobody has looked at, which are fit until something is found; their
     number is zero on entry."""
     g, at = wp.tid()
@@ -40,7 +40,7 @@ def list_fingers(hits: Hits, tried: TriedSets, usable_out: Usable, asked_out: As
 
 
 @wp.kernel
-def list_candidates(usable: Usable, asked_out: Asked):
+def list_candidates(usable: Usable, asked_out: AskedCandidates):
     """One thread per (pose, group): the usable candidates; their number is zero on entry."""
     row, g = wp.tid()
     shape = usable.unfit.shape
@@ -52,7 +52,7 @@ def list_candidates(usable: Usable, asked_out: Asked):
 
 
 @wp.func
-def _asked_at(asked: Asked, candidates: Candidates, i: wp.int32):
+def _asked_at(asked: AskedCandidates, candidates: Candidates, i: wp.int32):
     """Row, group and candidate of one that is listed."""
     slots = candidates.state.shape[2]
     groups = candidates.state.shape[1]
@@ -105,7 +105,7 @@ def _met(
 
 
 @wp.kernel
-def find_clashes(asked: Asked, hand: Hand, limits: Limits, candidates: Candidates, usable_out: Usable):
+def find_clashes(asked: AskedCandidates, hand: Hand, limits: Limits, candidates: Candidates, usable_out: Usable):
     """One thread per (finger, candidate listed): which postures of the two fingers meet; ``clash`` is zero on entry."""
     h, at = wp.tid()
     for i in range(at, asked.number[0], asked.stride):
@@ -120,7 +120,13 @@ def find_clashes(asked: Asked, hand: Hand, limits: Limits, candidates: Candidate
 
 @wp.kernel
 def find_sunk(
-    asked: Asked, hand: Hand, obj: Object, limits: Limits, candidates: Candidates, slices: wp.int32, usable_out: Usable
+    asked: AskedCandidates,
+    hand: Hand,
+    obj: Object,
+    limits: Limits,
+    candidates: Candidates,
+    slices: wp.int32,
+    usable_out: Usable,
 ):
     """One thread per (slice, body of a finger, candidate listed), so that neighbours do like work: fingers that sink
     into the object with a body, at any point, as the filter would find.
@@ -187,7 +193,7 @@ def _opens(
 
 @wp.kernel
 def find_stuck(
-    asked: Asked,
+    asked: AskedCandidates,
     hand: Hand,
     field: Field,
     obj: Object,

@@ -74,7 +74,7 @@ class Hits:
 
 
 @wp.struct
-class Asked:
+class AskedCandidates:
     """Candidates that are looked at."""
 
     number: wp.array(dtype=wp.int32)  # (1,) how many

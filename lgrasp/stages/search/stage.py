@@ -41,7 +41,7 @@ from lgrasp.stages.search.kernels import (
 )
 from lgrasp.stages.search.mutate_kernels import mutate_contacts
 from lgrasp.stages.search.params import MAX_KINDS, SearchParams
-from lgrasp.stages.search.sets import Asked, FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
+from lgrasp.stages.search.sets import AskedCandidates, FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
 from lgrasp.stages.search.swap_kernels import swap_contacts
 
 VERSION = 12
@@ -152,7 +152,7 @@ def _check_sets(
     if not usable.clash.size:
         check(check_fingers, (groups, groups, -1), [hand, values, inputs.struct], [tried])
     if usable.unfit.size:
-        asked = empty_struct(Asked, d, usable.unfit.size, **_no_entries(d))
+        asked = empty_struct(AskedCandidates, d, usable.unfit.size, **_no_entries(d))
         check(list_fingers, (groups, -1), [tried], [usable, asked])
         _check_fingers(asked, usable, inputs, context, params)
         check(check_fit, (-1,), [usable], [tried])
@@ -164,7 +164,7 @@ def _check_sets(
 def _find_clashes(usable: Usable, inputs: CandidateTable, context: Context) -> None:
     """Which usable candidates of two fingers meet."""
     d, size, groups = context.device, usable.unfit.size, context.hand.model.groups
-    asked = empty_struct(Asked, d, size, **_no_entries(d))
+    asked = empty_struct(AskedCandidates, d, size, **_no_entries(d))
     wp.launch(list_candidates, usable.size.shape, [usable], [asked], device=d)
     asked.stride, dim = _shared(size, (groups, -1))
     given = [asked, context.hand.struct, device_limits(context.bounds), inputs.struct]
@@ -172,7 +172,7 @@ def _find_clashes(usable: Usable, inputs: CandidateTable, context: Context) -> N
 
 
 def _check_fingers(
-    asked: Asked, usable: Usable, inputs: CandidateTable, context: Context, params: SearchParams
+    asked: AskedCandidates, usable: Usable, inputs: CandidateTable, context: Context, params: SearchParams
 ) -> None:
     """Which of the candidates that are listed the filter would refuse."""
     d, size, limits = context.device, usable.unfit.size, device_limits(context.bounds)
