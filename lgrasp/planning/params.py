@@ -1,5 +1,7 @@
 """Parameters of plans."""
 
+from typing import NamedTuple
+
 from pydantic import Field
 
 from lgrasp.config import Params
@@ -8,7 +10,17 @@ from lgrasp.hold.params import HoldTest
 from lgrasp.refine.params import DISTAL, OTHER, LocalSearch
 
 _CLOUD_GAP = 6.0e-3  # [m]
+_FEW_FINGERS = 3
 _PLAN_BOUNDS = GraspBounds(profile="plan")
+
+
+class Effort(NamedTuple):
+    """What :class:`PlanParams` leaves to the kind of hands, by the names there."""
+
+    draws: int
+    finalists: int
+    tried: int
+    hold: HoldTest
 
 
 class PlanParams(Params):
@@ -17,7 +29,13 @@ class PlanParams(Params):
     rolls: int = Field(
         default=30, ge=1, le=64, description="Hands that begin at each start, turned about the palm's normal."
     )
-    draws: int = Field(default=8, ge=1, le=64, description="Hands that a network draws for each start.")
+    draws: int | None = Field(
+        default=None,
+        ge=1,
+        le=64,
+        description="Hands that a network draws for each start; default: 8, or 24 where a hand has three fingers or "
+        "fewer, which hold less often.",
+    )
     thicker: float = Field(
         default=0.005,
         ge=0,
@@ -30,8 +48,12 @@ class PlanParams(Params):
         min_length=1,
         description="Angles between the surface's normal and the way back from it [deg], in turn.",
     )
-    finalists: int = Field(
-        default=10, ge=1, le=64, description="Number of hands that continue after the first matchings."
+    finalists: int | None = Field(
+        default=None,
+        ge=1,
+        le=64,
+        description="Hands of each start that continue after the first matchings; default: all that a network draws, "
+        "else 10.",
     )
     opening: int = Field(default=5, ge=1, le=100, description="Matchings of all of them.")
     clearance: float = Field(
@@ -63,17 +85,22 @@ class PlanParams(Params):
         ge=0,
         le=64,
         description="Hands of each start that are tried at most, those that resist most first, until one always holds: "
-        "the one that holds most often is the plan. 0: none; default: 3 of those that a network draws, else 10.",
+        "the one that holds most often is the plan. 0: none; default: 3 of 8 that a network draws, 5 of 24, else 10.",
     )
     hold: HoldTest | None = Field(
-        default=None, description="How they are tried; default: once those that a network draws, others with draws."
+        default=None, description="How they are tried; default: once those of 8 drawn by a network, others with draws."
     )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
-    def trials(self, *, drawn: bool) -> tuple[int, HoldTest]:
-        """``tried`` and ``hold`` as they are, of hands that a network drew or not."""
-        tried, hold = (3, HoldTest(draws=0)) if drawn else (10, HoldTest())
-        return tried if self.tried is None else self.tried, self.hold or hold
+    def effort(self, fingers: int | None) -> Effort:
+        """For hands with so many fingers that a network draws, or open ones (None)."""
+        if fingers is None:
+            own = Effort(1, 10, 10, HoldTest())
+        elif fingers <= _FEW_FINGERS:
+            own = Effort(24, 24, 5, HoldTest())
+        else:
+            own = Effort(8, 8, 3, HoldTest(draws=0))
+        return Effort(*(x if (given := getattr(self, name)) is None else given for name, x in own._asdict().items()))
 
     def weights(self) -> dict[str, float]:
         """Arguments of :func:`hand_surface`."""

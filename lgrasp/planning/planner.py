@@ -23,7 +23,7 @@ from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.kernels import invert_poses
-from lgrasp.planning.params import PlanParams
+from lgrasp.planning.params import Effort, PlanParams
 from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
@@ -69,7 +69,7 @@ class Planner:
         stand_off: distance of the hand's base from the surface at the start [m].
         palmar: where the hand may touch; default: where hand.yaml lets it.
         around: what else the hand must not touch, in the object's internal frame.
-        guesses: hands to begin with in place of open ones before the surface, ``draws`` of each start.
+        guesses: hands to begin with in place of open ones before the surface, as many of each start as are drawn.
     """
 
     hand: HandArrays
@@ -96,7 +96,7 @@ class Planner:
         points = np.arange(count)
         if self.guesses is None:
             points = farthest_points(self.model.contact_points.astype(float), count)
-        each = self.params.rolls if self.guesses is None else self.params.draws
+        each = self.params.rolls if self.guesses is None else self._effort.draws
         size, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_HANDS // each, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS], 0)
         tables = []
@@ -122,12 +122,16 @@ class Planner:
         return Planned(join_rows(tables), counts)
 
     @cached_property
+    def _effort(self) -> Effort:
+        return self.params.effort(None if self.guesses is None else self.hand.model.groups)
+
+    @cached_property
     def _scene(self) -> "_Scene":
         device, surface = self.hand.device, hand_surface(self.hand.model, self.palmar, **self.params.weights())
         around = None if self.around is None else upload_object(self.around, device)
         target = upload_target(self.model, self.around, device)
         obj, search = upload_object(self.model, device), Descent(self.hand, target, self.params.search, surface)
-        return _Scene(search, obj, around, _tester(self.hand, obj, self._trials[1]))
+        return _Scene(search, obj, around, _tester(self.hand, obj, self._effort.hold))
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
@@ -155,28 +159,29 @@ class Planner:
     def _guessed(self, starts: np.ndarray) -> tuple[np.ndarray, Hands]:
         """Starts, and the hands that were guessed for them."""
         assert self.guesses is not None
-        each = self.params.draws
+        each = self._effort.draws
         rows = (starts[:, None] * each + np.arange(each)).reshape(-1)
         return starts.repeat(each), self._inverse(self._put(self.guesses.pose[rows], self.guesses.q[rows]))
 
     def _finalists(self, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
         """The best hands of each start after the first matchings."""
-        p = self.params
-        if np.bincount(start).max() <= p.finalists:
+        if np.bincount(start).max() <= self._effort.finalists:
             return start, at
-        place, _ = self._ranked(start, at, _loosened(p.bounds))
-        rows = np.flatnonzero(place < p.finalists)
+        place, _ = self._ranked(start, at, _loosened(self.params.bounds))
+        rows = np.flatnonzero(place < self._effort.finalists)
         return start[rows], at.taken(rows)
 
     def _steadiest(self, start: np.ndarray, at: Hands) -> tuple[GraspTable, np.ndarray]:
         """One hand of each start, and its outcome: of those tried the one that holds most often, then the one that
         resists most."""
-        bounds, tried = self.params.bounds, self._trials[0]
+        bounds, tried = self.params.bounds, self._effort.tried
         place, passed = self._ranked(start, at, bounds)
         # what control poses show may fail any of them
         rows = np.flatnonzero((place < max(tried, 1)) | (passed if bounds_squeeze(bounds) else False))
         start, place, passed = start[rows], place[rows], passed[rows]
-        table, outcome = check_grasps(*self._posed(at.taken(rows), bounds), bounds, around=self._scene.around, index=start)
+        table, outcome = check_grasps(
+            *self._posed(at.taken(rows), bounds), bounds, around=self._scene.around, index=start
+        )
         held = self._held(table, np.where(passed, place, tried))
         order = np.lexsort([place, -held, outcome != Outcome.KEPT, start])
         best = np.sort(order[np.flatnonzero(np.diff(start[order], prepend=-1))])
@@ -197,7 +202,7 @@ class Planner:
         """Share of the trials in which each hand holds, (M,): of each start those at the first places are tried, until
         one always holds; twice as many at once each time, since few trials keep a GPU as long as many."""
         held, tester, first = np.zeros(len(place)), self._scene.tester, 0
-        tried, draws = self._trials[0], self._trials[1].draws
+        tried, draws = self._effort.tried, self._effort.hold.draws
         while tester is not None and first < tried:
             last = min(2 * first + 1, tried)
             done = np.isin(table.index, table.index[held == 1])
@@ -208,10 +213,6 @@ class Planner:
             held[rows] = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
             first = last
         return held
-
-    @cached_property
-    def _trials(self) -> tuple[int, HoldTest]:
-        return self.params.trials(drawn=self.guesses is not None)
 
     def _starts(self, points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Start of each hand (M,), the hands' bases (M, 7) and joints (M, K), and the directions they face (M, 3).
@@ -238,7 +239,9 @@ class Planner:
         wp.launch(invert_poses, len(back), [at.pose], [back], device=self.hand.device)
         return Hands(back, at.q)
 
-    def _posed(self, at: Hands, bounds: GraspBounds) -> tuple[HandArrays, ObjectArrays, wp.array, wp.array, ContactTable]:
+    def _posed(
+        self, at: Hands, bounds: GraspBounds
+    ) -> tuple[HandArrays, ObjectArrays, wp.array, wp.array, ContactTable]:
         """What a check takes of hands."""
         held, obj = self._inverse(at), self._scene.object
         contacts = find_contacts(self.hand, obj, held.pose, held.q, bounds, self.palmar)

@@ -26,7 +26,9 @@ class Hands:
     def taken(self, rows: np.ndarray) -> "Hands":
         """Some of them, by index; copied on the device."""
         chosen = wp.array(rows, dtype=wp.int32, device=self.q.device)
-        return Hands(wp.indexedarray(self.pose, [chosen]).contiguous(), wp.indexedarray(self.q, [chosen, None]).contiguous())
+        return Hands(
+            wp.indexedarray(self.pose, [chosen]).contiguous(), wp.indexedarray(self.q, [chosen, None]).contiguous()
+        )
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """Base (N, 7) and joint positions (N, K)."""

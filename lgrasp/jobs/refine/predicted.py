@@ -28,9 +28,10 @@ def predicted_planner(
         starts: how many there will be at most.
         palmar, around: as of :class:`Planner`.
     """
+    draws = params.effort(hand.model.groups).draws
     predictor = GraspPredictor(hand.model.tree, networks, model.contact_points, model.contact_normals, hand.device)
     _ = predictor.grid  # both threads need it
     with ThreadPoolExecutor(1) as pool:
-        drawn = pool.submit(predictor.draw, starts * params.draws, seed)
+        drawn = pool.submit(predictor.draw, starts * draws, seed)
         whole = model if len(model.faces) else predictor.completed(model, params.thicker)
     return Planner(hand, whole, 0.0, params, palmar, around, Guesses(*drawn.result()))
