@@ -261,6 +261,16 @@ def check_grasps(
     return table, outcome
 
 
+class Compared(NamedTuple):
+    """What n hands are ranked by, (n,) each."""
+
+    outcome: np.ndarray
+    """But for what control poses show."""
+    unresisted_load: np.ndarray
+    penetration: np.ndarray
+    """[m]"""
+
+
 def compare_grasps(
     hand: HandArrays,
     obj: ObjectArrays,
@@ -270,17 +280,12 @@ def compare_grasps(
     bounds: GraspBounds,
     *,
     around: ObjectArrays | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Outcomes of hands but for what control poses show, and unresisted loads, (n,) both: what :func:`check_grasps`
-    finds of these in several times the time.
-
-    Args: as of :func:`check_grasps`.
-    """
+) -> Compared:
+    """A part of what :func:`check_grasps` finds, sooner; ``Args`` as there."""
     limits = device_limits(bounds, deepest=_MAX_RANKED_PENETRATION)
     check = _measured(hand, obj, pose, q, contacts, limits, around, None)
     check.decide()
-    outcome, load = fetch([check.found.outcome, check.found.unresisted_load])
-    return outcome, load
+    return Compared(*fetch([getattr(check.found, name) for name in Compared._fields]))
 
 
 def _measured(

@@ -52,8 +52,8 @@ class PlanParams(Params):
         default=None,
         ge=1,
         le=64,
-        description="Hands of each start that continue after the first matchings; default: all that a network draws, "
-        "else 10.",
+        description="Hands of each start that continue after the first matchings; default: 5 of 8 and all of 24 that a "
+        "network draws, else 10.",
     )
     opening: int = Field(default=5, ge=1, le=100, description="Matchings of all of them.")
     clearance: float = Field(
@@ -99,7 +99,7 @@ class PlanParams(Params):
         elif fingers <= _FEW_FINGERS:
             own = Effort(24, 24, 5, HoldTest())
         else:
-            own = Effort(8, 8, 3, HoldTest(draws=0))
+            own = Effort(8, 5, 3, HoldTest(draws=0))
         return Effort(*(x if (given := getattr(self, name)) is None else given for name, x in own._asdict().items()))
 
     def weights(self) -> dict[str, float]:

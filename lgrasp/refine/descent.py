@@ -136,6 +136,7 @@ class Descent:
             limits=p.limits / len(tree.joint_lower),
             sgd=int(p.optimizer == "sgd"),
             middle=wp.vec3(*map(float, _middle(self._hand, surface))),
+            column=wp.array(tree.joint_column, dtype=wp.int32, device=self.device),
             **{name: wp.array(x, dtype=wp.float32, device=self.device) for name, x in ends.items()},
         )
 

@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.grasp.collision import plane_height
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
-from lgrasp.math.lanes import lanes_sum, meet
+from lgrasp.math.lanes import LANES, lanes_sum, meet
 from lgrasp.refine.energy_gradient import (
     DescentScratch,
     DescentScratches,
@@ -23,6 +23,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS | {"fast_math": True})
 
+_BLOCKS = (LANES, 24)  # threads of a block, and blocks at a time: few registers each, as hands wait for memory
 _TINY = wp.constant(1.0e-12)
 _SECOND_MOMENT_DECAY = wp.constant(0.99)  # decay of adam's second moment
 _LAST_ADVANCE = 1.0e-5  # [m] an advance that is shorter is the last
@@ -149,7 +150,7 @@ def _step(
     meet()
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=_BLOCKS)
 def descend(
     h: Kinematics,
     parts: Parts,

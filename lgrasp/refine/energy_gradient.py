@@ -102,6 +102,7 @@ class Search:
     radius: wp.float32
     lower: wp.array(dtype=wp.float32)  # (K,) [rad or m]
     upper: wp.array(dtype=wp.float32)  # (K,) [rad or m]
+    column: wp.array(dtype=wp.int32)  # (J,) column of q that moves each joint
     near: wp.array(dtype=wp.float32)  # (K,) distance from a limit within which it repels [rad or m]
 
 
@@ -292,9 +293,8 @@ def joint_pulls(h: Kinematics, s: Search, q: wp.array2d(dtype=wp.float32), row: 
         low = _repulsion((q[row, c] - s.lower[c]) / s.near[c])
         high = _repulsion((s.upper[c] - q[row, c]) / s.near[c])
         g = s.limits * (low - high) / s.near[c]
-        for group in range(h.groups):
-            for k in range(h.joint_first[group], h.joint_first[group + 1]):
-                if h.dof_index[h.dof_first[group] + h.joint_dof[k]] == c:
-                    g += w.by_joint[k]
+        for k in range(s.column.shape[0]):
+            if s.column[k] == c:
+                g += w.by_joint[k]
         w.by_q[c] = g
     meet()

@@ -59,9 +59,10 @@ def test_hands_are_compared_by_what_the_check_finds(planner, inputs):
     contacts = known_contacts(table.contact_links, table.contact_points, table.contact_normals, "cpu")
     hands = inputs.hand, inputs.object, table.pose, table.q, contacts, QUICK.bounds
     whole, outcome = check_grasps(*hands)
-    compared, load = compare_grasps(*hands)
-    np.testing.assert_array_equal(compared, outcome)
-    np.testing.assert_array_equal(load, whole.metrics["unresisted_load"])
+    found = compare_grasps(*hands)
+    np.testing.assert_array_equal(found.outcome, outcome)
+    for name in ("unresisted_load", "penetration"):
+        np.testing.assert_array_equal(getattr(found, name), whole.metrics[name])
     assert len(set(outcome.tolist())) > 1
 
 
