@@ -33,7 +33,7 @@ class PlanParams(Params):
         default=None,
         ge=1,
         le=64,
-        description="Hands that a network draws for each start; default: 8, or 24 where a hand has three fingers or "
+        description="Hands that a network draws for each start; default: 8, or 40 where a hand has three fingers or "
         "fewer, which hold less often.",
     )
     thicker: float = Field(
@@ -52,7 +52,7 @@ class PlanParams(Params):
         default=None,
         ge=1,
         le=64,
-        description="Hands of each start that continue after the first matchings; default: 5 of 8 and all of 24 that a "
+        description="Hands of each start that continue after the first matchings; default: 5 of 8 and 24 of 40 that a "
         "network draws, else 10.",
     )
     opening: int = Field(default=5, ge=1, le=100, description="Matchings of all of them.")
@@ -85,7 +85,7 @@ class PlanParams(Params):
         ge=0,
         le=64,
         description="Hands of each start that are tried at most, those that resist most first, until one always holds: "
-        "the one that holds most often is the plan. 0: none; default: 3 of 8 that a network draws, 5 of 24, else 10.",
+        "the one that holds most often is the plan. 0: none; default: 3 of 8 that a network draws, 8 of 40, else 10.",
     )
     hold: HoldTest | None = Field(
         default=None, description="How they are tried; default: once those of 8 drawn by a network, others with draws."
@@ -97,7 +97,7 @@ class PlanParams(Params):
         if fingers is None:
             own = Effort(1, 10, 10, HoldTest())
         elif fingers <= _FEW_FINGERS:
-            own = Effort(24, 24, 5, HoldTest())
+            own = Effort(40, 24, 8, HoldTest())
         else:
             own = Effort(8, 5, 3, HoldTest(draws=0))
         return Effort(*(x if (given := getattr(self, name)) is None else given for name, x in own._asdict().items()))
