@@ -130,7 +130,9 @@ def test_parameters_are_bounded():
 
 def test_hands_that_hold_less_often_are_drawn_and_tried_more_often_unless_told():
     few, many, opened = (PlanParams().effort(fingers) for fingers in (3, 4, None))
-    assert few.draws > many.draws and few.tried > many.tried and few.hold.draws > many.hold.draws
+    assert few.draws > many.draws
+    assert few.tried > many.tried
+    assert few.hold.draws > many.hold.draws
     assert opened.finalists == 10
     told = PlanParams(draws=6, finalists=2, tried=0, hold=HoldTest(draws=5))
     assert all(told.effort(fingers) == (6, 2, 0, told.hold) for fingers in (3, 4, None))
