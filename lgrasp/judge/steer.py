@@ -26,6 +26,7 @@ POSE_SLACK = 1e-4
 """Between the object's pose and one that was asked for [m], turns at LEVER."""
 LEVER = 0.1
 """[m]"""
+_TOGETHER = 4096  # poses of a hand on its way that are looked at together
 
 
 @dataclass(frozen=True)
@@ -211,8 +212,12 @@ def on_table(
     below = np.max([_below(hand, T, up, height) for T in (T_links, T_open, start)], axis=0)
     gap = np.abs((obj.mesh.vertices @ planes[:, :3].T).min(axis=0) - planes[:, 3])
     into, depth = np.linalg.inv(T_object)[:, None], np.zeros(len(back))
-    for way in np.arange(0.0, bounds.APPROACH_LENGTH + 1e-9, bounds.APPROACH_STEP):
-        depth = np.maximum(depth, np.max(hand_in_object(hand, obj, into @ _moved(T_open, way * back)), axis=0))
+    ways = np.arange(0.0, bounds.APPROACH_LENGTH + 1e-9, bounds.APPROACH_STEP)
+    for some in np.array_split(ways, np.clip(len(ways) * len(back) // _TOGETHER, 1, len(ways))):
+        T = np.concatenate([into @ _moved(T_open, way * back) for way in some])
+        depth = np.maximum(
+            depth, np.max(hand_in_object(hand, obj, T), axis=0).reshape(len(some), len(back)).max(axis=0)
+        )
     return below, gap, depth
 
 

@@ -24,6 +24,7 @@ LEAST_FREE = 32 << 20
 """Free bytes without which nothing is compiled into a folder: a full disk ends the compiler, and the process."""
 _CHECKSUMS = "sha256.json"
 _UNFINISHED = re.compile(r"_(p[0-9]+)_t[0-9]+$")  # of folders that Warp compiles in: process and thread
+_looked_at: dict[Path, int] = {}  # folders by :func:`note_checksums`: when they had changed last
 _LOADED = (".o", ".cubin", ".ptx", ".meta")  # what Warp reads; sources are for people
 
 
@@ -65,6 +66,11 @@ def has_compiled(folder: Path, *, cuda: bool) -> bool:
 
 def note_checksums(folder: Path) -> None:
     """Store the SHA-256 of the modules that have none: compiled by this process, or by one that was killed."""
+    with suppress(OSError):
+        changed = folder.stat().st_mtime_ns  # whoever compiles makes a folder of its own in it
+        if _looked_at.get(folder) == changed:
+            return
+        _looked_at[folder] = changed
     for module in _modules(folder):
         with suppress(OSError, OutputError):
             files = [path for path in module.iterdir() if path.suffix in _LOADED]
