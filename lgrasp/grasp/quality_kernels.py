@@ -5,8 +5,10 @@ import warp as wp
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION, TOUCH
 from lgrasp.math.constants import BALANCED, CONE_EDGES
+from lgrasp.math.frictionless import centroid
 from lgrasp.math.limits import MAX_CONTACTS
-from lgrasp.math.qp import balance, centroid, unresisted
+from lgrasp.math.loads import unresisted
+from lgrasp.math.qp import balance
 from lgrasp.math.quality import epsilon_bound
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object

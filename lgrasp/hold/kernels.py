@@ -105,7 +105,6 @@ class TrialPulls:
 class Workers:
     """Lanes that take one trial after another; W workers."""
 
-    lanes: wp.int32  # of a worker
     queue: wp.array(dtype=wp.int32)  # (1,) how many trials were taken
     scratch: Scratches  # W of it
 
@@ -300,7 +299,7 @@ def close_hands(
         trials: ``row`` and ``draw`` are given, all else is written.
     """
     worker, lane = wp.tid()
-    w = scratch_of(workers.scratch, worker, lane, workers.lanes)
+    w = scratch_of(workers.scratch, worker, lane)
     _describe(hand, w)
     i = _next(workers.queue, w)
     while i < trials.row.shape[0]:
@@ -325,7 +324,7 @@ def close_hands(
             trials.mass[i] = mass
             trials.material[i] = m
             trials.start[i] = s.pose
-        for k in range(lane, hand.kin.dof_first[hand.kin.groups], workers.lanes):
+        for k in range(lane, hand.kin.dof_first[hand.kin.groups], w.lanes):
             w.q[k] = grasps.pregrasp[row, hand.kin.dof_index[k]]
         meet()
         for phase in range(2):
@@ -333,9 +332,9 @@ def close_hands(
                 s = _go(hand, obj, course, grasps, trials, i, phase, s, w)
         if lane == 0:
             trials.motion[i] = s
-        for c in range(lane, s.contacts, workers.lanes):
+        for c in range(lane, s.contacts, w.lanes):
             trials.contacts[i, c] = w.contacts[c]
-        for k in range(lane, MAX_HAND_DOFS, workers.lanes):
+        for k in range(lane, MAX_HAND_DOFS, w.lanes):
             trials.q[i, k] = w.q[k]
         meet()
         i = _next(workers.queue, w)
@@ -355,7 +354,7 @@ def pull_objects(
     """Lanes of a worker, each time with the next trial and run of ``each`` directions, which ends at the first that is
     not held."""
     worker, lane = wp.tid()
-    w = scratch_of(workers.scratch, worker, lane, workers.lanes)
+    w = scratch_of(workers.scratch, worker, lane)
     _describe(hand, w)
     runs = 6 // each
     number = _next(workers.queue, w)
@@ -366,9 +365,9 @@ def pull_objects(
         for pull in range(first, first + each):
             if s.lost == 0:
                 s = trials.motion[i]
-                for c in range(lane, s.contacts, workers.lanes):
+                for c in range(lane, s.contacts, w.lanes):
                     w.contacts[c] = trials.contacts[i, c]
-                for k in range(lane, MAX_HAND_DOFS, workers.lanes):
+                for k in range(lane, MAX_HAND_DOFS, w.lanes):
                     w.q[k] = trials.q[i, k]
                 meet()
                 s = _go(hand, obj, course, grasps, trials, i, 2 + pull, s, w)

@@ -159,8 +159,7 @@ class HoldTester:
         runs = n * (ways // each)
         scratch = empty_scratches(min(runs, most), device)
         closing, pulling = (
-            make_struct(Workers, lanes=lanes, scratch=scratch, queue=wp.zeros(1, dtype=wp.int32, device=device))
-            for _ in range(2)
+            make_struct(Workers, scratch=scratch, queue=wp.zeros(1, dtype=wp.int32, device=device)) for _ in range(2)
         )
         how = {"device": device, "block_dim": LANES}
         wp.launch(close_hands, (min(n, most), lanes), [*both, spread, grasps, closing, trials], **how)

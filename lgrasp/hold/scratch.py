@@ -5,8 +5,8 @@ from typing import Any
 import warp as wp
 
 from lgrasp.math.limits import MAX_BODIES, MAX_DOFS, MAX_GROUPS
+from lgrasp.math.scratch import empty_rows, rows_of
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.runtime.structs import make_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -77,35 +77,7 @@ class Scratch:
     slope: wp.array(dtype=wp.float32)  # (6,) the object's gradient
 
 
-@wp.struct
-class Scratches:
-    """Of W trials: the arrays of :class:`Scratch`, (W, ...) each."""
-
-    contacts: wp.array2d(dtype=Contact)  # (W, MAX_TOUCHES)
-    before: wp.array2d(dtype=Contact)  # (W, MAX_TOUCHES)
-    made: wp.array2d(dtype=Contact)  # (W, MAX_TAGS)
-    Y: wp.array2d(dtype=wp.vec4)  # (W, MAX_TOUCHES)
-    Z: wp.array2d(dtype=wp.vec4)  # (W, MAX_TOUCHES)
-    press: wp.array2d(dtype=wp.float32)  # (W, MAX_TOUCHES)
-    terms: wp.array2d(dtype=Terms)  # (W, MAX_TOUCHES)
-    object_rows: wp.array2d(dtype=wp.spatial_vector)  # (W, MAX_TOUCHES * 6)
-    object_slope: wp.array2d(dtype=wp.float32)  # (W, MAX_TOUCHES * 6)
-    column: wp.array2d(dtype=wp.vec3)  # (W, MAX_TOUCHES * MAX_DOFS)
-    spin: wp.array2d(dtype=wp.float32)  # (W, MAX_TOUCHES * MAX_DOFS)
-    X: wp.array2d(dtype=wp.transform)  # (W, MAX_BODIES)
-    q: wp.array2d(dtype=wp.float32)  # (W, MAX_HAND_DOFS)
-    dq: wp.array2d(dtype=wp.float32)  # (W, MAX_HAND_DOFS)
-    target: wp.array2d(dtype=wp.float32)  # (W, MAX_HAND_DOFS)
-    scale: wp.array2d(dtype=wp.float32)  # (W, MAX_HAND_DOFS)
-    group: wp.array2d(dtype=wp.int32)  # (W, MAX_HAND_DOFS)
-    step: wp.array2d(dtype=wp.float32)  # (W, rows)
-    A: wp.array2d(dtype=wp.float32)  # (W, rows * MAX_DOFS)
-    B: wp.array2d(dtype=wp.spatial_vector)  # (W, rows)
-    b: wp.array2d(dtype=wp.float32)  # (W, rows)
-    C: wp.array2d(dtype=wp.spatial_vector)  # (W, 6)
-    c: wp.array2d(dtype=wp.float32)  # (W, 6)
-    slope: wp.array2d(dtype=wp.float32)  # (W, 6)
-
+Scratches, scratch_of = rows_of(Scratch)
 
 _SIZES = {
     **dict.fromkeys(("contacts", "before", "Y", "Z", "press", "terms"), MAX_TOUCHES),
@@ -122,39 +94,4 @@ _SIZES = {
 
 def empty_scratches(workers: int, device: str) -> Any:
     """Memory for as many trials at a time."""
-    kinds = {name: var.type.dtype for name, var in Scratches.vars.items()}
-    made = {name: wp.empty((workers, _SIZES[name]), dtype=kind, device=device) for name, kind in kinds.items()}
-    return make_struct(Scratches, **made)
-
-
-@wp.func
-def scratch_of(every: Scratches, i: wp.int32, lane: wp.int32, lanes: wp.int32):
-    """Memory i, as a lane sees it."""
-    w = Scratch()
-    w.lane = lane
-    w.lanes = lanes
-    w.contacts = every.contacts[i]
-    w.before = every.before[i]
-    w.made = every.made[i]
-    w.Y = every.Y[i]
-    w.Z = every.Z[i]
-    w.press = every.press[i]
-    w.terms = every.terms[i]
-    w.object_rows = every.object_rows[i]
-    w.object_slope = every.object_slope[i]
-    w.column = every.column[i]
-    w.spin = every.spin[i]
-    w.X = every.X[i]
-    w.q = every.q[i]
-    w.dq = every.dq[i]
-    w.target = every.target[i]
-    w.scale = every.scale[i]
-    w.group = every.group[i]
-    w.step = every.step[i]
-    w.A = every.A[i]
-    w.B = every.B[i]
-    w.b = every.b[i]
-    w.C = every.C[i]
-    w.c = every.c[i]
-    w.slope = every.slope[i]
-    return w
+    return empty_rows(Scratches, workers, _SIZES, device)

@@ -1,23 +1,20 @@
 """Exact small QPs: the point of least norm in the convex hull of contact wrenches (Wolfe's algorithm in 6-D).
 
-Both published scores are this problem: FSWO (eq. 1) over the k frictionless wrenches, GSWO (eq. 2) over friction
-cones. So is the resistance to an outside force, of a hull moved by that force.
+GSWO (eq. 2) is this problem over friction cones, and so is the resistance to an outside force
+(:mod:`lgrasp.math.loads`), of a hull moved by that force.
 """
 
 import warp as wp
 
 from lgrasp.math.cholesky import solving
-from lgrasp.math.constants import LOAD_ARM, LOAD_FORCE
 from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.math.transforms import tangent, vec3s
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.runtime.unrolled import unrolled
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _MAX_CORRAL = 8
-_LOAD_SCALE = wp.constant(1.0 / LOAD_ARM)  # [1/m]
-_EXACT, _LOAD_EXACT = wp.constant(1.0e-4), wp.constant(1.0e-3)  # relative errors of squared norms
+_EXACT = wp.constant(1.0e-4)  # relative error of squared norms
 _NO_LIMIT = wp.constant(1.0e15)
 
 vec6 = wp.types.vector(6, wp.float32)
@@ -25,13 +22,6 @@ vec8 = wp.types.vector(_MAX_CORRAL, wp.float32)
 mat8 = wp.types.matrix((_MAX_CORRAL, _MAX_CORRAL), wp.float32)
 mat86 = wp.types.matrix((_MAX_CORRAL, 6), wp.float32)
 mat83 = wp.types.matrix((_MAX_CORRAL, 3), wp.float32)
-mat63 = wp.types.matrix((MAX_CONTACTS, 3), wp.float32)
-mat_gram = wp.types.matrix((MAX_CONTACTS, MAX_CONTACTS), wp.float32)
-_FEW = 4  # contacts whose systems stay in registers
-mat_few = wp.types.matrix((_FEW, _FEW), wp.float32)
-mat_few3 = wp.types.matrix((_FEW, 3), wp.float32)
-vec_few = wp.types.vector(_FEW, wp.float32)
-vec_share = wp.types.vector(MAX_CONTACTS, wp.float32)
 
 
 @wp.func
@@ -93,7 +83,7 @@ class Program:
 
 
 @wp.func
-def _least_norm(arms: vec3s, normals: vec3s, k: wp.int32, p: Program, forces: vec3s):
+def least_norm(arms: vec3s, normals: vec3s, k: wp.int32, p: Program, forces: vec3s):
     """Point of least norm of ``p.load`` plus wrenches with f_i in the friction cone of n_i, by Wolfe's algorithm.
 
     Args:
@@ -248,7 +238,7 @@ def balance(
     p.edges = edges
     p.stop = stop
     p.limit = _NO_LIMIT
-    return _least_norm(arms, normals, k, p, forces)
+    return least_norm(arms, normals, k, p, forces)
 
 
 @wp.func
@@ -258,220 +248,4 @@ def balances(arms: vec3s, normals: vec3s, k: wp.int32, mu: wp.float32, torque_sc
     p = _balancing(mu, torque_scale)
     p.stop = limit
     p.limit = limit
-    return _least_norm(arms, normals, k, p, forces) <= limit
-
-
-@wp.func
-def _pull(turn: wp.quat, direction: wp.int32):
-    """Unit force along one of x, y, z, -x, -y, -z of the hand's base frame, turned by ``turn``."""
-    e = wp.vec3(0.0)
-    e[direction % 3] = wp.where(direction < 3, 1.0, -1.0)
-    return wp.quat_rotate(turn, e)
-
-
-@wp.func
-def unresisted(
-    arms: vec3s,
-    normals: vec3s,
-    k: wp.int32,
-    mu: wp.float32,
-    turn: wp.quat,
-    direction: wp.int32,
-    stop: wp.float32,
-    limit: wp.float32,
-):
-    """How much of a unit force e on the centre of mass stays unresisted, 0 to 1.
-
-    min |e + sum_i (f_i, arm_i x f_i / LOAD_ARM)| with f_i in the round friction cone of n_i and
-    sum_i f_i . n_i <= LOAD_FORCE: what cannot be held with so many times the load is not held.
-
-    Args:
-        arms: from the centre of mass [m]. normals: inward.
-        turn: from the hand's base frame to that of arms and normals.
-        direction: of e in the hand's base frame: x, y, z, -x, -y, -z.
-        stop, limit: return as soon as the answer is known to be below, above this.
-    """
-    forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
-    e = _pull(turn, direction)
-    p = Program()
-    p.friction = mu
-    p.torque_scale = _LOAD_SCALE
-    p.load = vec6(e[0], e[1], e[2], 0.0, 0.0, 0.0)
-    p.total = LOAD_FORCE
-    p.less = 1
-    p.stop = stop
-    p.limit = limit
-    p.exact = _LOAD_EXACT
-    return _least_norm(arms, normals, k, p, forces)
-
-
-@wp.func
-def by_difficulty(normals: vec3s, k: wp.int32, mu: wp.float32, turn: wp.quat, rank: wp.int32):
-    """The direction of :func:`unresisted` that is ``rank``-th (0: first) of the six in what contacts lack along it.
-
-    What they lack is a bound from forces alone, so that loads which nothing resists come first.
-    """
-    lack = vec6()
-    for axis in range(3):
-        e = _pull(turn, axis)
-        for i in range(k):
-            along = wp.dot(e, normals[i])
-            across = mu * wp.sqrt(wp.max(1.0 - along * along, 0.0))
-            lack[axis] = wp.min(lack[axis], along - across)
-            lack[axis + 3] = wp.min(lack[axis + 3], -along - across)
-    found = int(0)
-    for a in range(6):
-        before = int(0)
-        for b in range(6):
-            if lack[b] > lack[a] or (lack[b] == lack[a] and b < a):
-                before += 1
-        if before == rank:
-            found = a
-    return found
-
-
-@wp.func
-def centroid(points: vec3s, k: wp.int32):
-    """Mean of the first k points."""
-    c = wp.vec3(0.0)
-    for i in range(k):
-        c = c + points[i]
-    return c / float(k)
-
-
-@unrolled
-@wp.func
-def _frictionless_few(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.float32):
-    """:func:`frictionless` of at most _FEW contacts: the same with loops of known length."""
-    middle = centroid(points, k)
-    N = mat_few3()
-    W = mat_few3()
-    G = mat_few()
-    active = vec_few()
-    trace = float(0.0)
-    for i in range(wp.static(_FEW)):
-        if wp.static(i) < k:
-            active[i] = 1.0
-            N[i] = normals[i]
-            W[i] = wp.cross(points[i] - middle, normals[i]) * torque_scale
-        for j in range(wp.static(i + 1)):
-            G[i, wp.static(j)] = wp.dot(N[i], N[j]) + wp.dot(W[i], W[j])
-        trace += G[i, i]
-    eps = 1.0e-6 * trace / float(k)
-    least = float(0.0)
-    value = float(0.0)
-    for _drop in range(k):
-        # L D L^T of the active block; inactive rows are identity
-        L = mat_few()
-        M = mat_few()  # L D
-        inverse = vec_few()  # of D
-        z = vec_few()
-        for i in range(wp.static(_FEW)):
-            d = active[i] * G[i, i] + wp.where(active[i] > 0.0, eps, 1.0)
-            y = active[wp.static(i)]
-            for j in range(i):
-                s = active[i] * active[j] * G[i, j]
-                for c in range(j):
-                    s -= M[i, wp.static(c)] * L[j, c]
-                M[i, wp.static(j)] = s
-                L[i, j] = s * inverse[j]
-                d -= s * L[i, j]
-                y -= L[i, j] * z[j]
-            inverse[i] = 1.0 / wp.max(d, eps * 0.01)
-            z[i] = y
-        total = float(0.0)
-        low = float(1.0e30)
-        drop = int(0)
-        for b in range(wp.static(_FEW)):
-            i = wp.static(_FEW - 1 - b)
-            s = z[i] * inverse[i]
-            for c in range(wp.static(_FEW - b), wp.static(_FEW)):
-                s -= L[wp.static(c), i] * z[c]
-            z[i] = s
-            if active[i] > 0.0:
-                total += s
-                if s < low:
-                    low = s
-                    drop = i
-        value = 1.0 / wp.max(total, 1.0e-12)
-        if low >= 0.0:
-            if _drop == 0:
-                least = low * value
-            break
-        for i in range(wp.static(_FEW)):
-            active[i] = wp.where(wp.static(i) == drop, 0.0, active[i])
-    return wp.vec2(wp.sqrt(wp.max(value - eps, 0.0)), least)
-
-
-@wp.func
-def frictionless(points: vec3s, normals: vec3s, k: wp.int32, torque_scale: wp.float32):
-    """FSWO (eq. 1) by active sets on the k x k Gram matrix, for the inner loop of the search.
-
-    The full-support solution is exact when all its shares are positive. Otherwise the smallest share is dropped and the
-    rest solved again, which gives a feasible point, so an upper bound: good enough to steer, and never accepted since a
-    contact without force is not.
-
-    Returns:
-        (least norm, smallest share of the normal force; 0 when a contact was dropped).
-    """
-    if k <= _FEW:
-        return _frictionless_few(points, normals, k, torque_scale)
-    middle = centroid(points, k)
-    G = mat_gram()
-    W = mat63()
-    trace = float(0.0)
-    for i in range(k):
-        t = wp.cross(points[i] - middle, normals[i]) * torque_scale
-        W[i] = t
-        for j in range(i + 1):
-            g = wp.dot(normals[i], normals[j]) + wp.dot(t, W[j])
-            G[i, j] = g
-            G[j, i] = g
-        trace += G[i, i]
-    eps = 1.0e-6 * trace / float(k)
-    active = vec_share()
-    for i in range(k):
-        active[i] = 1.0
-    least = float(0.0)
-    value = float(0.0)
-    for _drop in range(k):
-        # Cholesky of the active block; inactive rows are identity
-        L = mat_gram()
-        z = vec_share()
-        for i in range(k):
-            if active[i] > 0.0:
-                for j in range(i + 1):
-                    if active[j] > 0.0:
-                        s = G[i, j]
-                        for c in range(j):
-                            s -= L[i, c] * L[j, c]
-                        if i == j:
-                            L[i, i] = wp.sqrt(wp.max(s + eps, eps * 0.01))
-                        else:
-                            L[i, j] = s / L[j, j]
-                s = float(1.0)
-                for c in range(i):
-                    s -= L[i, c] * z[c]
-                z[i] = s / L[i, i]
-        total = float(0.0)
-        low = float(1.0e30)
-        drop = int(0)
-        for b in range(k):
-            i = k - 1 - b
-            if active[i] > 0.0:
-                s = z[i]
-                for c in range(i + 1, k):
-                    if active[c] > 0.0:
-                        s -= L[c, i] * z[c]
-                z[i] = s / L[i, i]
-                total += z[i]
-                if z[i] < low:
-                    low = z[i]
-                    drop = i
-        value = 1.0 / wp.max(total, 1.0e-12)
-        if low >= 0.0:
-            if _drop == 0:
-                least = low * value
-            break
-        active[drop] = 0.0
-    return wp.vec2(wp.sqrt(wp.max(value - eps, 0.0)), least)
+    return least_norm(arms, normals, k, p, forces) <= limit

@@ -1,5 +1,7 @@
 """The local search on a device: matches and gradient steps of many hands, without a graph."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -9,6 +11,7 @@ from lgrasp.geometry.poses import device_matrix
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.hand.palm import palm_axis
 from lgrasp.math.lanes import LANES, lanes_of
+from lgrasp.math.scratch import empty_rows
 from lgrasp.refine.descent_kernels import Moments, Parts, Schedule, advance, descend, penetration
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, DescentScratches, Search
 from lgrasp.refine.hands import Hands
@@ -201,14 +204,11 @@ class Descent:
 
     def _scratch(self, rows: int) -> "DescentScratches":
         """For as many hands as are moved at a time."""
-        lanes = lanes_of(self.device)
-        most = _WORKERS if lanes > 1 else 1
+        most = _WORKERS if lanes_of(self.device) > 1 else 1
         parts = self._points.body.shape[0] + self.params.contacts + self._solids.body.shape[0]
-        wide = dict.fromkeys(("X", "F", "M"), self._bodies) | {"by_joint": self._bodies, "moved": 6}
+        wide: dict[str, Any] = dict.fromkeys(("X", "F", "M"), self._bodies) | {"by_joint": self._bodies, "moved": 6}
         wide |= dict.fromkeys(("part_body", "part_force", "part_moment"), parts) | {"by_q": self._hand.model.dofs}
-        kinds = {name: DescentScratches.vars[name].type.dtype for name in wide}
-        made = {n: wp.empty((min(rows, most), wide[n]), dtype=kinds[n], device=self.device) for n in wide}
-        return make_struct(DescentScratches, lanes=lanes, **made)
+        return empty_rows(DescentScratches, min(rows, most), wide, self.device)
 
 
 def _middle(hand: HandArrays, surface: HandSurface) -> np.ndarray:

@@ -11,6 +11,7 @@ import warp as wp
 from lgrasp.grasp.collision import plane_height
 from lgrasp.math.kinematics import Kinematics
 from lgrasp.math.lanes import lanes_least, lanes_sum, meet, neighbours_sum
+from lgrasp.math.scratch import rows_of
 from lgrasp.refine.match_kernels import LINK_DEEPEST, Correspondences, Points, Solids
 from lgrasp.refine.params import LENGTH, STEEPEST
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
@@ -44,38 +45,7 @@ class DescentScratch:
     moved: wp.array(dtype=wp.float32)  # (6,) translation [m] and rotation [rad] of a step
 
 
-@wp.struct
-class DescentScratches:
-    """The arrays of W hands."""
-
-    lanes: wp.int32
-    X: wp.array2d(dtype=wp.transform)  # (W, B)
-    F: wp.array2d(dtype=wp.vec3)  # (W, B)
-    M: wp.array2d(dtype=wp.vec3)  # (W, B)
-    part_body: wp.array2d(dtype=wp.int32)  # (W, parts)
-    part_force: wp.array2d(dtype=wp.vec3)  # (W, parts)
-    part_moment: wp.array2d(dtype=wp.vec3)  # (W, parts)
-    by_joint: wp.array2d(dtype=wp.float32)  # (W, J)
-    by_q: wp.array2d(dtype=wp.float32)  # (W, K)
-    moved: wp.array2d(dtype=wp.float32)  # (W, 6)
-
-
-@wp.func
-def scratch_of(every: DescentScratches, i: wp.int32, lane: wp.int32):
-    """Memory i, as a lane sees it."""
-    w = DescentScratch()
-    w.lane = lane
-    w.lanes = every.lanes
-    w.X = every.X[i]
-    w.F = every.F[i]
-    w.M = every.M[i]
-    w.part_body = every.part_body[i]
-    w.part_force = every.part_force[i]
-    w.part_moment = every.part_moment[i]
-    w.by_joint = every.by_joint[i]
-    w.by_q = every.by_q[i]
-    w.moved = every.moved[i]
-    return w
+DescentScratches, scratch_of = rows_of(DescentScratch)
 
 
 @wp.struct

@@ -14,13 +14,13 @@ from typing import Any
 
 import warp as wp
 
+from lgrasp.math.lanes import LANES
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.runtime.structs import make_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_LANES = 32  # threads of a block, and what its rows are filled up to
 _LEAST = wp.constant(1.0e-10)
 _NEWTON = wp.constant(12)  # iterations for the multiplier
 
@@ -230,7 +230,7 @@ class NoSlip:
     def __init__(self, m: Any, d: Any, iterations: int) -> None:
         self._d, self._iterations = d, iterations
         worlds, room = d.nworld, d.njmax
-        width = -(-m.nv // _LANES) * _LANES
+        width = -(-m.nv // LANES) * LANES  # rows are filled up
         self._inertia = make_struct(_Inertia, length=m.M_rownnz, first=m.M_rowadr, column=m.M_colind, value=d.M)
         e, c = d.efc, d.contact
         friction = wp.array(ptr=c.friction.ptr, dtype=wp.float32, shape=(len(c.friction), 5), copy=False)
@@ -265,4 +265,4 @@ class NoSlip:
         wp.launch(_factor, d.nworld, [self._inertia, *forces], [scratch, d.qacc])
         wp.launch(self._fill, (d.nworld, d.njmax), [self._rows, self._inertia], [scratch])
         inputs = [self._rows, scratch, self._iterations]
-        wp.launch_tiled(self._sweep, dim=[d.nworld], inputs=inputs, outputs=[d.qacc], block_dim=_LANES)
+        wp.launch_tiled(self._sweep, dim=[d.nworld], inputs=inputs, outputs=[d.qacc], block_dim=LANES)

@@ -40,7 +40,7 @@ def step_once(
 ):
     """One step of one hand with joints q (K,) [rad] and contacts (C,); what joints and contacts do is left in the
     scratch memory."""
-    w = scratch_of(scratch, 0, 0, 1)
+    w = scratch_of(scratch, 0, 0)
     for g in range(hand.kin.groups):
         v = vec_dof()
         first = hand.kin.dof_first[g]

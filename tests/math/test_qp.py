@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.wrench import cone_forces, is_balanced, residual, unresisted
 
-from lgrasp.math import qp
+from lgrasp.math import loads
+from lgrasp.math.frictionless import frictionless
 from lgrasp.math.limits import MAX_CONTACTS
-from lgrasp.math.qp import balance, balances, by_difficulty, frictionless
+from lgrasp.math.qp import balance, balances
 from lgrasp.math.transforms import vec3s
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -107,8 +108,8 @@ def _disturbance(
     worst = float(0.0)
     for rank in range(6):
         if worst <= limit:
-            direction = by_difficulty(normals, k, mu, turn[i], rank)
-            worst = wp.max(worst, qp.unresisted(arms, normals, k, mu, turn[i], direction, worst, limit))
+            direction = loads.by_difficulty(normals, k, mu, turn[i], rank)
+            worst = wp.max(worst, loads.unresisted(arms, normals, k, mu, turn[i], direction, worst, limit))
     worst_out[i] = worst
 
 
@@ -137,7 +138,7 @@ def _decide(
     take(arm, normal, i, arm.shape[1], arms, normals)
     balances_out[i] = balances(arms, normals, arm.shape[1], mu, SCALE, limit)
     for rank in range(6):
-        order_out[i, rank] = by_difficulty(normals, arm.shape[1], mu, wp.quat_identity(), rank)
+        order_out[i, rank] = loads.by_difficulty(normals, arm.shape[1], mu, wp.quat_identity(), rank)
 
 
 def units(rng: np.random.Generator, *shape: int) -> np.ndarray:

@@ -10,7 +10,8 @@ from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.constants import INSCRIBED
 from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_CONTACTS, MAX_JOINTS
-from lgrasp.math.qp import balances, by_difficulty, unresisted
+from lgrasp.math.loads import by_difficulty, unresisted
+from lgrasp.math.qp import balances
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS

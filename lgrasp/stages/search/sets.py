@@ -4,8 +4,9 @@ import warp as wp
 
 from lgrasp.grasp.structs import Candidates
 from lgrasp.math.constants import INSCRIBED
+from lgrasp.math.frictionless import centroid, frictionless
 from lgrasp.math.limits import MAX_CONTACTS, MAX_GROUPS
-from lgrasp.math.qp import balance, centroid, frictionless
+from lgrasp.math.qp import balance
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS

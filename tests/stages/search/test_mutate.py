@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 from lgrasp.engine.batch import run_stages
+from lgrasp.math.frictionless import frictionless
 from lgrasp.math.limits import MAX_CONTACTS
-from lgrasp.math.qp import frictionless
 from lgrasp.math.transforms import tangent
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
