@@ -142,7 +142,8 @@ def _bench_hand(
     progress: Callable[[str], None],
 ) -> dict[str, Any]:
     source, model = named_hand(cache, hand, at)
-    arrays, palmar = upload_hand(model, at.alias), palmar_side(cache, source, model, at)
+    touching, palmar = palmar_side(cache, source, model, at)
+    arrays = upload_hand(touching, at.alias)
     record = hand_record(model, mesh_blobs(source.urdf))
     stand_off = source.spec.stand_off or STAND_OFF
     totals = {name: _Total() for name in planners}

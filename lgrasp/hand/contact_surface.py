@@ -6,7 +6,7 @@ import numpy as np
 
 from lgrasp.hand.model import HandModel
 
-PALMAR_VERSION = 1
+PALMAR_VERSION = 2
 """Raised whenever the palmar side of a hand changes."""
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 from lgrasp.errors import DecomposeError, HandError, short_reason
 from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.decompose import Decompose
+from lgrasp.geometry.edges import sample_creases
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.tree import Tree
@@ -19,6 +20,7 @@ _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by hal
 _CYLINDER_SIDES = 32
 _MAX_BODIES = 16  # of one mesh
 _SHARP_CELL, _MOST_SHARP = 0.002, 96
+_CREASE_ANGLE = 45.0  # [deg]
 _MIN_HULL_SHARE = 0.9  # a body that fills less of its hull ...
 _MAX_DENT = 4.0e-3  # ... and lies deeper below it [m] somewhere is cut into convex pieces
 _MOST_PIECES = 8  # of one collision element; kernels go through all of them
@@ -269,12 +271,15 @@ def inner_spheres(piece: Piece, count: int, rng: np.random.Generator) -> np.ndar
 
 
 def surface_samples(mesh: trimesh.Trimesh, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """Points (n, 3) on a mesh no farther apart than about ``spacing`` [m], sharp vertices included."""
+    """Points (n, 3) on a mesh no farther apart than about ``spacing`` [m], along its sharp edges and at its sharp
+    vertices too: they poke deepest between others."""
     area = float(mesh.area)
     n = int(np.clip(4 * area / spacing**2, 64, 20000))
     points = trimesh.sample.sample_surface(mesh, n, seed=int(rng.integers(2**31)))[0]
-    # those that poke deepest between samples
+    creases = sample_creases(mesh.vertices, mesh.faces, _CREASE_ANGLE, spacing)[0]
     hull = mesh.convex_hull
     order = np.argsort(-hull.vertex_defects, kind="stable")
     sharp = hull.vertices[order]
-    return np.vstack([points[one_per_cell(points, spacing)], sharp[one_per_cell(sharp, _SHARP_CELL)[:_MOST_SHARP]]])
+    corners = sharp[one_per_cell(sharp, _SHARP_CELL)[:_MOST_SHARP]]
+    points = np.vstack([creases, points])
+    return np.vstack([points[one_per_cell(points, spacing)], corners])

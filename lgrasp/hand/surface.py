@@ -11,6 +11,16 @@ from lgrasp.hand.model import csr, stack_rows
 from lgrasp.hand.tree import Tree
 from lgrasp.object.sdf import SdfGrid
 
+_OF_LINK = ("grid_shape", "grid_origin", "grid_cell", "grid_link")
+_RUN_OF_LINK = {
+    "grid_values": "grid_first",
+    "rules": "rule_first",
+    "mesh_vertices": "mesh_vertex_first",
+    "mesh_faces": "mesh_face_first",
+}
+LINK_ARRAYS = (*_OF_LINK, *_RUN_OF_LINK, *_RUN_OF_LINK.values())
+"""Arrays of a HandModel by link that may touch: its distance grid, rules and mesh."""
+
 
 @dataclass(frozen=True)
 class ContactLink:
@@ -119,14 +129,9 @@ def with_bare_links(arrays: Mapping[str, np.ndarray], others: Mapping[str, np.nd
     """
     out = dict(arrays)
     for i in np.flatnonzero(~np.isin(others["grid_link"], arrays["grid_link"])):
-        for name in ("grid_shape", "grid_origin", "grid_cell", "grid_link"):
+        for name in _OF_LINK:
             out[name] = np.concatenate([out[name], others[name][i : i + 1]])
-        for first, name in (
-            ("grid_first", "grid_values"),
-            ("rule_first", "rules"),
-            ("mesh_vertex_first", "mesh_vertices"),
-            ("mesh_face_first", "mesh_faces"),
-        ):
+        for name, first in _RUN_OF_LINK.items():
             part = others[name][others[first][i] : others[first][i + 1]]
             out[name] = np.concatenate([out[name], part])
             out[first] = np.append(out[first], out[first][-1] + len(part)).astype(np.int32)

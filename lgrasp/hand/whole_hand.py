@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.surface import ContactLink, contact_arrays
+from lgrasp.hand.surface import ContactLink, contact_arrays, with_bare_links
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.hand.urdf import Urdf, read_urdf
 from lgrasp.object.sdf import SdfGrid
@@ -44,6 +45,25 @@ def whole_hand(source: HandSource, model: HandModel, device: str) -> HandModel:
 def _thinned(link: ContactLink) -> ContactLink:
     """The link with fewer points, so that the field draws about as many contacts of each link."""
     return replace(link, points=link.points[:_MOST_POINTS], normals=link.normals[:_MOST_POINTS])
+
+
+def palmar_hand(source: HandSource, model: HandModel, side: ContactSurface, device: str) -> HandModel:
+    """The same hand with distance grids and meshes of all links of a palmar side, so that contacts there are measured
+    as those of the links that hand.yaml lists.
+
+    Args:
+        source: what ``model`` was built from. device: answers the geometric queries.
+    """
+    tree = model.tree
+    links = []
+    for link in np.setdiff1d(side.link, model.grid_link):
+        group, own = tree.group_of(tree.link_names[link]), side.link == link
+        group = group if group >= 0 else model.groups
+        links.append(ContactLink(tree.link_names[link], group, side.points[own], side.normals[own], np.empty((0, 4))))
+    if not links:
+        return model
+    others = surface_arrays(model, read_urdf(source.urdf), links, device)
+    return replace(model, **with_bare_links({name: getattr(model, name) for name in others}, others))
 
 
 def listed_links(model: HandModel) -> list[ContactLink]:

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ from lgrasp.hand.find import HandSource, rules_of_known
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.params import LISTED, HandParams
 from lgrasp.hand.spec import HandSpec
+from lgrasp.hand.surface import LINK_ARRAYS
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
+from lgrasp.hand.whole_hand import palmar_hand
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.records import RULES
 from lgrasp.object.model import ObjectModel
@@ -45,13 +48,18 @@ def named_hand(cache: Cache, name: str, device: Device) -> tuple[HandSource, Han
     return _built(cache, hand_source(name), device)
 
 
-def palmar_side(cache: Cache, source: HandSource, hand: HandModel, device: Device) -> ContactSurface:
-    """:func:`~lgrasp.hand.surface_visibility.visible_surface` of a hand; cached."""
+def palmar_side(cache: Cache, source: HandSource, hand: HandModel, device: Device) -> tuple[HandModel, ContactSurface]:
+    """What touches in plans: the hand with meshes of all links of its palmar side
+    (:func:`~lgrasp.hand.whole_hand.palmar_hand`), and the side; cached."""
 
     def make() -> dict[str, np.ndarray]:
-        return visible_surface(source, hand, device.alias)._asdict()
+        side = visible_surface(source, hand, device.alias)
+        whole = palmar_hand(source, hand, side, device.alias)
+        return {**side._asdict(), **{name: getattr(whole, name) for name in LINK_ARRAYS}}
 
-    return ContactSurface(**cache.get("palmar", content_key("palmar", PALMAR_VERSION, hand=hand.sha256), make)[0])
+    arrays = cache.get("palmar", content_key("palmar", PALMAR_VERSION, hand=hand.sha256), make)[0]
+    side = ContactSurface(*(arrays[name] for name in ContactSurface._fields))
+    return replace(hand, **{name: arrays[name] for name in LINK_ARRAYS}), side
 
 
 def hand_of_shard(

@@ -17,8 +17,8 @@ import trimesh
 from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError, short_reason
+from lgrasp.geometry.edges import open_edges
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
-from lgrasp.object.edges import open_edges
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import check_file

@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial import QhullError
 
 from lgrasp.errors import ObjectError
-from lgrasp.object.edges import open_edges
+from lgrasp.geometry.edges import open_edges
 
 _FLAT = 1e-6  # of the spreads of points along their main axes, the least over the largest
 _LEAST_VOLUME = 1e-12  # over the cubed largest side; a closed mesh of less bounds nothing

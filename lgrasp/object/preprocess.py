@@ -6,17 +6,16 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.clusters import bounding_spheres, cluster_order
+from lgrasp.geometry.edges import face_normals, sample_creases
 from lgrasp.object.load import load_mesh
 from lgrasp.object.mass import mass_properties
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid, build_sdf
 from lgrasp.object.surface import (
-    face_normals,
     fold_cosine,
     opposite_points,
     probe_fits,
-    sample_creases,
     sample_surface,
     thin,
 )

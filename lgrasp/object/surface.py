@@ -5,7 +5,7 @@ import warp as wp
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from lgrasp.object.edges import face_neighbours
+from lgrasp.geometry.edges import face_neighbours, face_normals
 from lgrasp.object.sdf import SdfGrid, sample_sdf
 from lgrasp.runtime.fetch import to_numpy
 
@@ -14,14 +14,6 @@ from . import kernels
 _OPPOSED = float(np.cos(np.radians(30.0)))  # of the line between two opposite points to their normals, at least
 _OVERSAMPLE = 5  # candidates for one point kept
 _WALK_FACES = 256  # faces visited around a point in the fold test
-
-
-def face_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals, shape (f, 3), zero for a degenerate face, and areas [m²], shape (f,)."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    cross = np.cross(b - a, c - a)
-    double = np.linalg.norm(cross, axis=1)
-    return cross / np.where(double > 0.0, double, 1.0)[:, None], 0.5 * double
 
 
 def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, *, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -42,30 +34,6 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, *, seed:
     points = np.einsum("nk,nkd->nd", weights, vertices[faces[face]])
     order = rng.permutation(total)
     return points[order], face[order].astype(np.int32)
-
-
-def sample_creases(
-    vertices: np.ndarray, faces: np.ndarray, angle: float, spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points along edges that turn by more than ``angle`` [deg], their corners first.
-
-    Returns:
-        Points [m], shape (n, 3), and the mean normals of the two faces, shape (n, 3).
-    """
-    normals, _ = face_normals(vertices, faces)
-    neighbour = face_neighbours(faces)
-    f, e = np.nonzero(neighbour > np.arange(len(faces))[:, None])
-    g = neighbour[f, e]
-    turned = np.einsum("nd,nd->n", normals[f], normals[g]) < np.cos(np.radians(angle))
-    f, e, g = f[turned], e[turned], g[turned]
-    start, end = vertices[faces[f, e]], vertices[faces[f, (e + 1) % 3]]
-    mean = normals[f] + normals[g]
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
-    pieces = np.maximum(np.ceil(np.linalg.norm(end - start, axis=1) / spacing).astype(int), 1)
-    row = np.repeat(np.arange(len(f)), pieces)
-    t = (np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[row]
-    points = np.concatenate([start, end, start[row] + t[:, None] * (end - start)[row]])
-    return points, np.concatenate([mean, mean, mean[row]])
 
 
 def thin(points: np.ndarray, count: int, area: float) -> np.ndarray:

@@ -87,6 +87,8 @@ def test_plans_keep_the_bounds_they_promise(mug):
     assert report.values["penetration_mm"].max() <= PENETRATION + ROUNDING
     assert report.values["contact_link_mm"].max() <= GAP + ROUNDING
     assert report.values["normal_deg"].max() <= ANGLE + 1.0
+    gap = 1e3 * read_shard(mug).grasps.metrics["gap"]
+    np.testing.assert_allclose(report.values["contact_link_mm"], gap, atol=ROUNDING)
 
 
 def test_two_fingers_touch_or_one_and_the_palm(mug):

@@ -12,6 +12,7 @@ from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.run import run
 from lgrasp.errors import ConfigError
+from lgrasp.geometry.edges import face_normals
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.held import hold
 from lgrasp.grasp.predicted import TouchingGrasps, upload_predicted
@@ -24,7 +25,7 @@ from lgrasp.jobs.sequence.round import run_round
 from lgrasp.jobs.sequence.sample import SampleJob
 from lgrasp.learn.diffuser.file import load_diffuser
 from lgrasp.learn.diffuser.params import DiffuserParams
-from lgrasp.object.surface import face_normals, sample_surface
+from lgrasp.object.surface import sample_surface
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.tally import Meter

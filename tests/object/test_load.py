@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from lgrasp.errors import ObjectError
-from lgrasp.object.edges import open_edges
 from lgrasp.object.find import find_object, list_objects
 from lgrasp.object.load import load_mesh
 from lgrasp.object.params import ObjectParams
@@ -199,11 +198,6 @@ def test_scene_is_joined(tmp_path):
     assert len(loaded.faces) == 24
     assert np.ptp(loaded.vertices, axis=0)[0] == pytest.approx(0.25)
     assert "joined 2 geometries into one object" in loaded.notes
-
-
-def test_open_edges_of_one_triangle():
-    assert sorted(map(tuple, open_edges(np.array([[0, 1, 2]])))) == [(0, 1), (1, 2), (2, 0)]
-    assert len(open_edges(BOX.faces)) == 0
 
 
 def test_unknown_parameter_is_refused():

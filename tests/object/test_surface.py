@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_order
-from lgrasp.object.edges import face_neighbours
 from lgrasp.object.sdf import build_sdf
-from lgrasp.object.surface import fold_cosine, probe_fits, sample_creases, sample_surface, thin
+from lgrasp.object.surface import fold_cosine, probe_fits, sample_surface, thin
 
 
 def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
@@ -63,26 +62,6 @@ def test_samples_are_area_weighted_and_on_their_faces():
     assert share == pytest.approx(mesh.area_faces / mesh.area, abs=1e-3)
     plane = np.einsum("nd,nd->n", points - vertices[faces[face, 0]], mesh.face_normals[face])
     assert np.abs(plane).max() < 1e-12
-
-
-def test_creases_cover_the_edges_of_a_box():
-    mesh = trimesh.creation.box(extents=(0.1, 0.1, 0.1))
-    points, normals = sample_creases(*arrays(mesh), 30.0, 0.01)
-    assert (np.isclose(np.abs(points), 0.05).sum(axis=1) >= 2).all()
-    assert (np.einsum("nd,nd->n", points, normals) > 0.0).all()
-    assert len(sample_creases(*arrays(trimesh.creation.icosphere(subdivisions=3)), 30.0, 0.01)[0]) == 0
-
-
-def test_neighbours_are_mutual():
-    _, faces = arrays(trimesh.creation.icosphere(subdivisions=1))
-    near = face_neighbours(faces)
-    assert all(f in near[g] for f in range(len(faces)) for g in near[f])
-    shared = {tuple(sorted(e)) for e in np.array([[faces[5][e], faces[5][(e + 1) % 3]] for e in range(3)])}
-    for e in range(3):
-        edge = {faces[5][e], faces[5][(e + 1) % 3]}
-        assert edge <= set(faces[near[5, e]])
-    assert len(shared) == 3
-    assert (face_neighbours(faces[1:]) == -1).sum() == 3
 
 
 def test_fold_test_sees_edges_but_not_through_walls():

@@ -8,8 +8,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset.report.coverage import principal_postures
+from lgrasp.geometry.edges import face_normals
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.object.surface import face_normals, sample_surface
+from lgrasp.object.surface import sample_surface
 
 TOUCH_DISTANCE = 0.005
 """[m] from a contact to what it covers of the surface."""

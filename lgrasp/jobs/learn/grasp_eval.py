@@ -65,8 +65,8 @@ def evaluate(
     first = next(iter(parts.values()))
     source, hand = hand_of_shard(cache, first.hand, first.config, found)
     check_network_hand(path, networks.hand, networks.hand_sha256, hand.name, hand.sha256, words=SHARDS)
-    palmar = palmar_side(cache, source, hand, found)
-    bench = _Bench(networks, source, upload_hand(hand, found.alias), palmar, starts)
+    touching, palmar = palmar_side(cache, source, hand, found)
+    bench = _Bench(networks, source, upload_hand(touching, found.alias), palmar, starts)
     begin = time.perf_counter()
     kinds: dict[str, Any] = {kind: {} for kind in KINDS}
     for number, (_, part) in enumerate(sorted(parts.items())):

@@ -33,7 +33,7 @@ from lgrasp.planning.params import PlanParams, cloud_params
 from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import STAND_OFF
 
-VERSION = 5
+VERSION = 6
 """Raised whenever plans change for the same parameters."""
 
 _OBSTACLE_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
@@ -93,8 +93,8 @@ class PlanJob(PlanRequest, Job):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         source, hand, model, around = self._models()
-        palmar = palmar_side(self.cache, source, hand, self.device_used)
-        plan, arrays = self._params(), upload_hand(hand, self.device_used.alias)
+        touching, palmar = palmar_side(self.cache, source, hand, self.device_used)
+        plan, arrays = self._params(), upload_hand(touching, self.device_used.alias)
         begin, networks = time.perf_counter(), self.networks()
         if networks is None:
             planner = Planner(arrays, model, self._stand_off(), plan, palmar, around)
