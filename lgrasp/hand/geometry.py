@@ -11,6 +11,7 @@ from lgrasp.errors import DecomposeError, HandError, short_reason
 from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.edges import sample_creases
+from lgrasp.geometry.hulls import convex_hull, farthest_corners, fewer_corners
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.tree import Tree
@@ -27,19 +28,6 @@ _MOST_PIECES = 8  # of one collision element; kernels go through all of them
 _MAX_UNCOVERED = 7.0e-4  # pieces may leave out no more of the true surface [m]
 MOST_FACES = 40_000
 """Collision meshes with more faces are thinned to about this many."""
-
-
-def _hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    hull = ConvexHull(points)
-    planes = np.unique(np.round(hull.equations, 9), axis=0)
-    return points[hull.vertices], np.column_stack([planes[:, :3], -planes[:, 3]])
-
-
-def spread_directions(n: int) -> np.ndarray:
-    """n well-spread unit vectors (Fibonacci), (n, 3)."""
-    i = np.arange(n) + 0.5
-    phi, theta = np.arccos(1 - 2 * i / n), np.pi * (1 + 5**0.5) * i
-    return np.column_stack([np.cos(theta) * np.sin(phi), np.sin(theta) * np.sin(phi), np.cos(phi)])
 
 
 def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
@@ -113,7 +101,7 @@ def convex_piece(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> Piece
         ring = np.column_stack([r * np.cos(angle), r * np.sin(angle)])
         h = geometry.size[1] / 2
         points = np.vstack([np.column_stack([ring, np.full(len(ring), z)]) for z in (-h, h)])
-        return Piece(*_hull(points), 0.0)
+        return Piece(*convex_hull(points), 0.0)
     try:
         return _hull_piece(np.asarray(mesh.vertices, float))
     except QhullError:
@@ -124,29 +112,21 @@ def convex_piece(urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh) -> Piece
 
 def _hull_piece(points: np.ndarray) -> Piece:
     """The hull of points (n, 3), thinned and inflated so that it is true within half of _HULL_ERROR."""
-    vertices, planes = _hull(points)
+    vertices, planes = convex_hull(points)
     if len(vertices) <= 48:
         return Piece(vertices, planes, 0.0)
 
-    def thinned(kept: np.ndarray) -> tuple[Piece, np.ndarray]:
-        thin, thin_planes = _hull(vertices[kept])
-        excess = vertices @ thin_planes[:, :3].T - thin_planes[:, 3]
-        return Piece(thin, thin_planes, max(float(excess.max()), 0.0) / 2), excess
+    def thinned(kept: np.ndarray) -> tuple[Piece, float]:
+        thin, thin_planes = convex_hull(vertices[kept])
+        excess = float((vertices @ thin_planes[:, :3].T - thin_planes[:, 3]).max())
+        return Piece(thin, thin_planes, max(excess, 0.0) / 2), excess
 
     for count in (24, 48, 96, 192, 384):
-        piece, excess = thinned(np.unique(np.argmax(vertices @ spread_directions(count).T, axis=0)))
-        if excess.max() <= _HULL_ERROR:
+        piece, excess = thinned(farthest_corners(vertices, count))
+        if excess <= _HULL_ERROR:
             return piece
-    # edges and flat sides: directions miss what matters there; add the vertex farthest out of each face instead
-    kept = np.unique(np.argmax(vertices @ spread_directions(24).T, axis=0))
-    while True:
-        piece, excess = thinned(kept)
-        if excess.max() <= _HULL_ERROR:
-            return piece
-        more = np.union1d(kept, excess.argmax(0)[excess.max(0) > _HULL_ERROR])
-        if len(more) == len(kept):  # rounding
-            return Piece(vertices, planes, 0.0)
-        kept = more
+    piece, excess = thinned(fewer_corners(vertices, _HULL_ERROR, apart=False))
+    return piece if excess <= _HULL_ERROR else Piece(vertices, planes, 0.0)  # rounding
 
 
 def convex_pieces(

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lgrasp.errors import HandError
+from lgrasp.geometry.hulls import farthest_corners
 from lgrasp.hand.digest import urdf_digest
-from lgrasp.hand.geometry import geometry_mesh, spread_directions
+from lgrasp.hand.geometry import geometry_mesh
 from lgrasp.hand.urdf import Geometry, Joint, Urdf, check_robot, read_robot
 
 if TYPE_CHECKING:
@@ -146,4 +147,4 @@ def _points(urdf: Urdf, chain: tuple[Joint, ...]) -> dict[str, np.ndarray]:
 def _corners(urdf: Urdf, geometry: Geometry) -> np.ndarray:
     """The farthest vertices of a collision element in many directions, in the frame of its link [m], shape [P, 3]."""
     vertices = geometry_mesh(urdf, geometry).apply_transform(geometry.T_link_geometry).vertices
-    return vertices[np.unique(np.argmax(vertices @ spread_directions(_CORNERS).T, 0))]
+    return vertices[farthest_corners(vertices, _CORNERS)]

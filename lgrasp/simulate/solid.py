@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from lgrasp.errors import DecomposeError, ObjectError
 from lgrasp.geometry.decompose import Decompose
+from lgrasp.geometry.hulls import fewer_corners
 from lgrasp.hand.distance import signed_distance
 from lgrasp.object.mass import mass_properties
 
@@ -15,6 +16,8 @@ _ALLOWED_DENT = 2.0e-3  # dents shallower than this [m] may stay filled
 _MOST_PIECES = 128
 _EFFORTS = ((1.5e-4, _ALLOWED_DENT, 180.0), (5.0e-4, 2 * _ALLOWED_DENT, 120.0))
 # tried in turn: surface details [m] that are smoothed away first, dents [m] that may stay filled, time [s]
+_HULL_ERROR = 2.0e-4  # corners of a piece that matter less than this [m] are left out; engines go through them all
+_FEW_CORNERS = 32  # of a piece that is left as it is
 _MIN_PIECE_VOLUME = 1.0e-11  # [m^3] a piece of less volume is left out
 
 
@@ -57,7 +60,7 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
     body = mass_properties(mesh.vertices, mesh.faces)
     if not body.solid:
         notes.append("the mesh is not closed; mass and inertia are those of its convex hull")
-    pieces = [mesh.vertices[hull.vertices]]
+    pieces = [_thinned(mesh.vertices[hull.vertices])]
     excess = _excess(mesh, pieces, device)
     if excess > _ALLOWED_DENT:
         failures = []
@@ -97,10 +100,15 @@ def _cut(mesh: trimesh.Trimesh, decompose: Decompose, detail: float, dent: float
         except QhullError:
             continue
         if hull.volume > _MIN_PIECE_VOLUME:
-            pieces.append(vertices[hull.vertices])
+            pieces.append(_thinned(vertices[hull.vertices]))
     if not pieces:
         raise DecomposeError("convex decomposition gave slivers only")
     return pieces
+
+
+def _thinned(corners: np.ndarray) -> np.ndarray:
+    """Those of a hull's corners (V, 3) that its shape needs."""
+    return corners if len(corners) <= _FEW_CORNERS else corners[fewer_corners(corners, _HULL_ERROR)]
 
 
 def _simplified(mesh: trimesh.Trimesh, detail: float) -> trimesh.Trimesh:

@@ -12,6 +12,7 @@ from support.solids import YOU, no_cut, prism
 
 from lgrasp.engine.cache import Cache
 from lgrasp.geometry.decompose import decompose
+from lgrasp.hand.distance import signed_distance
 from lgrasp.simulate.assemble import bare_urdf
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.protocol import PROTOCOLS
@@ -97,6 +98,18 @@ def test_a_dent_stays_open(tmp_path):
     assert hull.excess == pytest.approx(0.006, abs=3e-4)  # half the slot's width
     assert hull.notes == ("the convex hull stands for the mesh, its dents are filled (made up)",)
     assert hull.volume == cut.volume == pytest.approx(prism(YOU, 0.02).volume, rel=1e-5)
+
+
+def test_pieces_follow_the_mesh_with_few_corners():
+    """A smooth ball is a piece of some hundred corners within a fifth of a millimetre, and weighs as the mesh."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
+    solid = object_of_record(mesh_record("ball", ball), no_cut)
+    (piece,) = solid.pieces
+    assert len(piece) < len(ball.vertices) / 2
+    hull = trimesh.convex.convex_hull(piece)
+    assert signed_distance(hull, np.asarray(ball.vertices)).max() < 2.1e-4
+    assert hull.volume > 0.98 * ball.volume
+    assert solid.volume == pytest.approx(ball.volume, rel=1e-5)
 
 
 def test_a_mesh_that_is_not_closed_is_said():

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import convolve1d
 
-from lgrasp.hand.geometry import spread_directions
+from lgrasp.geometry.hulls import spread_directions
 from lgrasp.hand.postures import Postures
 
 _MIN_CELL = 0.010  # [m], more where fingers reach farther than hands do
