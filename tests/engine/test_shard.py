@@ -137,7 +137,7 @@ def test_a_cancelled_shard_goes_on_where_it_was(swift, inputs, tmp_path):
         swift, inputs, 0, 400, Execution(1, 256), bank_cache=cache, banked=False, resume=False, progress=cancel
     )
     assert tried[:4] == [256, 512, 768, 1024]
-    whole = make_shard(swift, inputs, 0, 400, Execution(2, 512))
+    whole = make_shard(swift, inputs, 0, 400, Execution(2, 256))
     assert again.candidates == whole.candidates
     (_, stopped), (continued, end) = again.spans
     assert stopped <= continued

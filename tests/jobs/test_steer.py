@@ -205,7 +205,7 @@ def test_refined_rows_are_free_but_stay_above_the_plane(steered, cache_root, tmp
 @pytest.mark.parametrize("kind", [".npz", ".csv", ".h5"])
 def test_the_object_is_where_the_file_says(steered, run, swift, tmp_path, kind):
     (path,) = run(rows=20).paths[:1]
-    poses = read_shard(path).grasps.object_pose[:, 0].astype(float)
+    poses = np.unique(read_shard(path).grasps.object_pose[:, 0].astype(float), axis=0)  # some have several rows
     if kind != ".h5":
         path = tmp_path / f"poses{kind}"
     if kind == ".npz":
