@@ -11,6 +11,7 @@ from lgrasp.refine.params import DISTAL, OTHER, LocalSearch
 
 _CLOUD_GAP = 6.0e-3  # [m]
 _FEW_FINGERS = 3
+_DRAWN_ROUNDS = 12  # 20 give no more plans that hold
 _PLAN_BOUNDS = GraspBounds(profile="plan")
 
 
@@ -20,6 +21,7 @@ class Effort(NamedTuple):
     draws: int
     finalists: int
     tried: int
+    matching_rounds: int
     hold: HoldTest
 
 
@@ -56,6 +58,12 @@ class PlanParams(Params):
         "network draws, else 10.",
     )
     opening: int = Field(default=5, ge=1, le=100, description="Matchings of all of them.")
+    matching_rounds: int | None = Field(
+        default=None,
+        ge=1,
+        le=1000,
+        description="Matchings of those that continue; default: 12 of 8 that a network draws, else those of `search`.",
+    )
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
     )
@@ -94,12 +102,13 @@ class PlanParams(Params):
 
     def effort(self, fingers: int | None) -> Effort:
         """For hands with so many fingers that a network draws, or open ones (None)."""
+        rounds = self.search.matching_rounds
         if fingers is None:
-            own = Effort(1, 10, 10, HoldTest())
+            own = Effort(1, 10, 10, rounds, HoldTest())
         elif fingers <= _FEW_FINGERS:
-            own = Effort(40, 24, 8, HoldTest())
+            own = Effort(40, 24, 8, rounds, HoldTest())
         else:
-            own = Effort(8, 5, 3, HoldTest(draws=0))
+            own = Effort(8, 5, 3, _DRAWN_ROUNDS, HoldTest(draws=0))
         return Effort(*(x if (given := getattr(self, name)) is None else given for name, x in own._asdict().items()))
 
     def weights(self) -> dict[str, float]:

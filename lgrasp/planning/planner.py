@@ -136,12 +136,12 @@ class Planner:
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
-        p = self.params
+        p, rounds = self.params, self._effort.matching_rounds
         start, at = self._opened(search, points, first) if self.guesses is None else self._guessed(points)
         if len(start):
-            search.run(at, rounds=p.opening)
+            search.run(at, rounds=min(p.opening, rounds), whole=rounds)
             start, at = self._finalists(start, at)
-            search.run(at, first=p.opening)
+            search.run(at, first=p.opening, rounds=rounds, whole=rounds)
             return self._steadiest(start, at)
         return check_grasps(*self._posed(at, p.bounds), p.bounds, index=start)
 

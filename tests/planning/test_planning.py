@@ -134,5 +134,6 @@ def test_hands_that_hold_less_often_are_drawn_and_tried_more_often_unless_told()
     assert few.tried > many.tried
     assert few.hold.draws > many.hold.draws
     assert opened.finalists == 10
-    told = PlanParams(draws=6, finalists=2, tried=0, hold=HoldTest(draws=5))
-    assert all(told.effort(fingers) == (6, 2, 0, told.hold) for fingers in (3, 4, None))
+    assert opened.matching_rounds == few.matching_rounds == PlanParams().search.matching_rounds > many.matching_rounds
+    told = PlanParams(draws=6, finalists=2, tried=0, matching_rounds=7, hold=HoldTest(draws=5))
+    assert all(told.effort(fingers) == (6, 2, 0, 7, told.hold) for fingers in (3, 4, None))
