@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lgrasp.engine.families import search_families
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
 from lgrasp.errors import ConfigError
@@ -120,7 +119,7 @@ def run_batch(
     in the same order. With several passes the poses that yielded are searched again, in every block of PASS_BLOCK
     candidates after one another and the best-yielding first; batches are then whole blocks. Rows of pass p have
     ``p << PASS_SHIFT`` added to the number of their candidate. Where poses have families
-    (:mod:`~lgrasp.engine.families`), their rows come after those of their block.
+    (:mod:`~lgrasp.stages.place.family`), their rows come after those of their block.
 
     Args:
         search: runs the stages up to search, such as :meth:`GraphCache.run`; None launches them one by one.
@@ -139,6 +138,7 @@ def run_batch(
             found = _run_through(again, table, pipeline, context.with_salt(salt), meter)
             parts.append(replace(found, index=found.index + (salt << PASS_SHIFT)))
     if pipeline.families and len(grasps):
+        from lgrasp.stages.place.family import search_families  # as stages, where it is used
 
         def finish(poses: PoseTable, own: Context) -> GraspTable:
             return _run_through(pipeline.order[1:], poses, pipeline, own, meter)
