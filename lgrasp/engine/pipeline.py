@@ -75,6 +75,11 @@ class Pipeline(_Head):
         return self.params("place").table or self.steer.above is not None
 
     @property
+    def families(self) -> bool:
+        """True if poses near those that gave grasps are searched; not where it is asked where the object may be."""
+        return self.params("place").family > 1 and not self.on_table and not self.steer.asks
+
+    @property
     def sections(self) -> tuple[tuple[Stage, BaseModel], ...]:
         """Everything that has parameters and a version: the stages, and ``sequence`` where there is one."""
         stages = tuple((STAGES[name], params) for name, params in self.stages)
