@@ -11,7 +11,7 @@ from lgrasp.refine.params import DISTAL, OTHER, LocalSearch
 
 _CLOUD_GAP = 6.0e-3  # [m]
 _FEW_FINGERS = 3
-_DRAWN_ROUNDS = 12  # 20 give no more plans that hold
+_DRAWN_ROUNDS = 16  # 20 give no more plans that hold, 12 a few fewer
 _PLAN_BOUNDS = GraspBounds(profile="plan")
 
 
@@ -62,7 +62,7 @@ class PlanParams(Params):
         default=None,
         ge=1,
         le=1000,
-        description="Matchings of those that continue; default: 12 of 8 that a network draws, else those of `search`.",
+        description="Matchings of those that continue; default: 16 of 8 that a network draws, else those of `search`.",
     )
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
