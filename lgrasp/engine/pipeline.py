@@ -76,8 +76,8 @@ class Pipeline(_Head):
 
     @property
     def families(self) -> bool:
-        """True if poses near those that gave grasps are searched; not where it is asked where the object may be."""
-        return self.params("place").family > 1 and not self.on_table and not self.steer.asks
+        """True if poses near those that gave grasps are searched."""
+        return self.params("place").family > 1
 
     @property
     def sections(self) -> tuple[tuple[Stage, BaseModel], ...]:
@@ -108,12 +108,17 @@ class Pipeline(_Head):
         return self.model_copy(update={"bounds": self.bounds.changed(**changes)}).checked()
 
     def checked(self) -> "Pipeline":
-        """Itself, unless a bound asks for a stage that it lacks, rounds for contacts that come too late for them, or
-        sequences for contacts outside their opposition spaces.
+        """Itself, unless a bound asks for a stage that it lacks, rounds for contacts that come too late for them,
+        sequences for contacts outside their opposition spaces, or families of grasps that are steered.
 
         Raises:
-            ConfigError: such a bound, such rounds or contacts.
+            ConfigError: such a bound, such rounds, contacts or families.
         """
+        if self.families and (self.on_table or self.steer.asks):
+            raise ConfigError(
+                f"pipeline {self.name}: place.family is {self.params('place').family}; grasps that are steered or on a "
+                "table have no families"
+            )
         if not self.realised and (rounds := self.params("domain").rounds) > 1:
             raise ConfigError(
                 f"pipeline {self.name}: domain.rounds is {rounds}; with search before ik contacts are drawn once"
@@ -174,11 +179,12 @@ class Pipeline(_Head):
         Raises:
             ConfigError: a value that cannot be.
         """
-        return self.model_copy(update={"steer": parse_model(Steering, self.steer.model_dump() | asked, "steer")})
+        asked = self.steer.model_dump() | asked
+        return self.model_copy(update={"steer": parse_model(Steering, asked, "steer")}).checked()
 
     def with_table(self) -> "Pipeline":
         """A copy whose grasps leave room for the table that the object rests on."""
-        return self.with_params("place", table=True)
+        return self.with_params("place", table=True).checked()
 
     def with_simulation(self, protocol: str) -> "Pipeline":
         """A copy that keeps only grasps which hold under a protocol of :mod:`lgrasp.simulate.protocol`.

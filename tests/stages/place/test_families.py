@@ -5,6 +5,7 @@ import pytest
 
 from lgrasp.engine.batch import run_batch
 from lgrasp.engine.shard import Execution, make_shard
+from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.numbers import origins, pose_numbers
@@ -63,6 +64,7 @@ def test_no_near_duplicates(families, inputs):
 
 
 def test_none_where_it_is_asked_where_the_object_may_be(families):
-    assert families.families
-    assert not families.with_table().families
-    assert not families.with_steering(approach="0,0,-1:30").families
+    with pytest.raises(ConfigError, match="have no families"):
+        families.with_table()
+    with pytest.raises(ConfigError, match=r"place\.family is 4"):
+        families.with_steering(approach="0,0,-1:30")
