@@ -60,7 +60,7 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
     body = mass_properties(mesh.vertices, mesh.faces)
     if not body.solid:
         notes.append("the mesh is not closed; mass and inertia are those of its convex hull")
-    pieces = [_thinned(mesh.vertices[hull.vertices])]
+    pieces = [mesh.vertices[hull.vertices]]
     excess = _excess(mesh, pieces, device)
     if excess > _ALLOWED_DENT:
         failures = []
@@ -75,7 +75,7 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
             notes.append(f"the convex hull stands for the mesh, its dents are filled ({failures[-1]})")
     return Solid(
         name=name,
-        pieces=tuple(np.ascontiguousarray(piece, float) for piece in pieces),
+        pieces=tuple(np.ascontiguousarray(_thinned(piece), float) for piece in pieces),
         volume=body.volume,
         center=body.center,
         inertia=body.inertia,
@@ -100,7 +100,7 @@ def _cut(mesh: trimesh.Trimesh, decompose: Decompose, detail: float, dent: float
         except QhullError:
             continue
         if hull.volume > _MIN_PIECE_VOLUME:
-            pieces.append(_thinned(vertices[hull.vertices]))
+            pieces.append(vertices[hull.vertices])
     if not pieces:
         raise DecomposeError("convex decomposition gave slivers only")
     return pieces

@@ -164,13 +164,14 @@ def test_every_row_passes_the_judge(source, done):
 def test_a_valid_row_is_replaced_by_one_that_resists_pulls_better(source, done, refine, tmp_path):
     """By one that was moved, or that touches at more links than the row says."""
     still = refine(source, tmp_path, params=RefineParams(matching_rounds=0))
-    for shard, least in ((done, 4), (still, 0)):
+    before, after, _ = both(source, still)
+    np.testing.assert_array_equal(after.q, before.q)
+    np.testing.assert_allclose(after.object_pose, before.object_pose, atol=1e-6)
+    for shard, least in ((still, 0), (done, 4)):
         before, after, replaced = both(source, shard)
         improved = replaced & np.isin(after.candidate, read_shard(still).grasps.candidate)
         assert improved.sum() >= least
         assert (after.metrics["unresisted_load"][improved] < before.metrics["unresisted_load"][improved]).all()
-    np.testing.assert_array_equal(after.q, before.q)
-    np.testing.assert_allclose(after.object_pose, before.object_pose, atol=1e-6)
     mesh = read_shard(source).objects[0]
     centre = trimesh.Trimesh(mesh.vertices, mesh.faces).center_mass
     for row in np.flatnonzero(improved).tolist():
