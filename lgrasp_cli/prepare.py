@@ -123,6 +123,7 @@ _STAGES = {
     "ik": "Move fingers to their contacts and keep those that do not collide with the object.",
     "wrap": "Lay further links of the touching fingers on the object.",
     "search": "Combine contacts into sets that balance.",
+    "adjust": "Move object and fingers together until the contacts of a set are made.",
     "filter": "Complete the grasps and check them exactly.",
     "hold": "Test in a fast simulation how well finished grasps hold.",
 }

@@ -91,6 +91,7 @@ SURVIVORS = {
     "ik": "kept",
     "wrap": "wrapped",
     "search": "sets",
+    "adjust": "kept",
     "filter": "kept",
     "refine": "tried",
     "hold": "held",

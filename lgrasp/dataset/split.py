@@ -14,7 +14,7 @@ from lgrasp.dataset.gather import gather
 from lgrasp.dataset.json_file import JsonFile
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ConfigError, ShardError
-from lgrasp.grasp.numbers import origins
+from lgrasp.grasp.schema import POSE_BITS
 from lgrasp.seeding import mixed
 
 SHARES = {"train": 0.8, "val": 0.1, "test": 0.1}
@@ -189,9 +189,9 @@ def _first(reader: ShardReader) -> np.ndarray:
 
 
 def _pose_numbers(reader: ShardReader, seed: int) -> np.ndarray:
-    """A random number for the object of each row and the drawn pose that it goes back to, shape [N], uint64."""
+    """A random number for the object of each row and the pose that it was made from, shape [N], uint64."""
     objects = np.array([*(_number(f"{seed}/{sha256}") for _, sha256, _ in reader.object_keys), 0], np.uint64)
-    return mixed(objects[_first(reader)] + mixed(origins(reader.column("candidate"))))
+    return mixed(objects[_first(reader)] + mixed(reader.column("candidate") & np.uint64(POSE_BITS)))
 
 
 def _number(text: str) -> int:

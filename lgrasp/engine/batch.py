@@ -10,17 +10,8 @@ import warp as wp
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
 from lgrasp.errors import ConfigError
-from lgrasp.grasp.numbers import origins
 from lgrasp.grasp.schema import PASS_SHIFT
-from lgrasp.grasp.tables import (
-    CandidateTable,
-    ContactSets,
-    GraspTable,
-    PoseTable,
-    join_rows,
-    select_poses,
-    take_rows,
-)
+from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_rows, select_poses, take_rows
 from lgrasp.hand.model import HandModel
 from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.tally import Meter
@@ -118,8 +109,7 @@ def run_batch(
     A pure function of its arguments, and of the batch alone: cutting the stream into other batches gives the same rows
     in the same order. With several passes the poses that yielded are searched again, in every block of PASS_BLOCK
     candidates after one another and the best-yielding first; batches are then whole blocks. Rows of pass p have
-    ``p << PASS_SHIFT`` added to the number of their candidate. Where poses have families
-    (:mod:`~lgrasp.stages.place.family`), their rows come after those of their block.
+    ``p << PASS_SHIFT`` added to the number of their candidate.
 
     Args:
         search: runs the stages up to search, such as :meth:`GraphCache.run`; None launches them one by one.
@@ -130,22 +120,14 @@ def run_batch(
         meter = Meter(context.device)
         sets = run_stages(pipeline, context, first, count, "search", meter)
     grasps = _run_through(pipeline.order[pipeline.order.index("search") + 1 :], sets, pipeline, context, meter)
-    place, passes, parts = pipeline.params("place"), pipeline.params("search").passes, [grasps]
+    passes = pipeline.params("search").passes
     if passes > 1:
         table = _yielding(sets.candidates, grasps, context.device)
         again = pipeline.order[pipeline.order.index("search") :]
+        parts = [grasps]
         for salt in range(1, passes):
             found = _run_through(again, table, pipeline, context.with_salt(salt), meter)
             parts.append(replace(found, index=found.index + (salt << PASS_SHIFT)))
-    if pipeline.families and len(grasps):
-        from lgrasp.stages.place.family import search_families  # as stages, where it is used
-
-        def finish(poses: PoseTable, own: Context) -> GraspTable:
-            return _run_through(pipeline.order[1:], poses, pipeline, own, meter)
-
-        table = _yielding(sets.candidates, grasps, context.device).poses
-        parts += search_families(table, place, context, meter, finish)
-    if len(parts) > 1:
         grasps = _by_blocks(join_rows(parts))
     return BatchResult(grasps, meter.counts, meter.seconds)
 
@@ -165,5 +147,5 @@ def _yielding(table: CandidateTable, grasps: GraspTable, device: str) -> Candida
 
 def _by_blocks(grasps: GraspTable) -> GraspTable:
     """Rows in the order of their blocks, within a block as they are: pass by pass."""
-    block = origins(grasps.index) // np.uint64(PASS_BLOCK)
+    block = (grasps.index & ((1 << PASS_SHIFT) - 1)) // PASS_BLOCK
     return take_rows(grasps, np.argsort(block, kind="stable"))

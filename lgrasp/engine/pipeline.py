@@ -67,7 +67,7 @@ class Pipeline(_Head):
     @property
     def realised(self) -> bool:
         """True if ik comes before search."""
-        return self.order.index("ik") < self.order.index("search")
+        return "ik" in self.order and self.order.index("ik") < self.order.index("search")
 
     @property
     def on_table(self) -> bool:
@@ -75,9 +75,9 @@ class Pipeline(_Head):
         return self.params("place").table or self.steer.above is not None
 
     @property
-    def families(self) -> bool:
-        """True if poses near those that gave grasps are searched."""
-        return self.params("place").family > 1
+    def poses_stay(self) -> bool:
+        """True if the object stays where it is placed: on a table, where poses are given, or the approach is."""
+        return self.on_table or self.steer.pose is not None or self.steer.approach is not None
 
     @property
     def sections(self) -> tuple[tuple[Stage, BaseModel], ...]:
@@ -99,6 +99,22 @@ class Pipeline(_Head):
         stages = tuple((n, changed if n == stage else p) for n, p in self.stages)
         return self.model_copy(update={"stages": stages})
 
+    def suited(self, joints: float) -> "Pipeline":
+        """A copy with one of stages ik and adjust where the pipeline has both.
+
+        Args:
+            joints: of their own that half the fingers of the hand have at most.
+        """
+        if not {"ik", "adjust"} <= {*self.order}:
+            return self
+        adjusts = joints <= self.params("adjust").joints and not self.poses_stay
+        return self.without("ik" if adjusts else "adjust")
+
+    def without(self, stage: str) -> "Pipeline":
+        """A copy that lacks a stage; without ik contacts are drawn once."""
+        kept = self.model_copy(update={"stages": tuple(s for s in self.stages if s[0] != stage)})
+        return kept.with_params("domain", rounds=1) if stage == "ik" and stage in self.order else kept
+
     def with_bounds(self, **changes: Any) -> "Pipeline":
         """A copy with some of the bounds replaced and checked.
 
@@ -109,15 +125,15 @@ class Pipeline(_Head):
 
     def checked(self) -> "Pipeline":
         """Itself, unless a bound asks for a stage that it lacks, rounds for contacts that come too late for them,
-        sequences for contacts outside their opposition spaces, or families of grasps that are steered.
+        sequences for contacts outside their opposition spaces, or an object is moved that has to stay.
 
         Raises:
-            ConfigError: such a bound, such rounds, contacts or families.
+            ConfigError: such a bound, such rounds or contacts, or such an object.
         """
-        if self.families and (self.on_table or self.steer.asks):
+        if "adjust" in self.order and (self.sequence or ("ik" not in self.order and self.poses_stay)):
             raise ConfigError(
-                f"pipeline {self.name}: place.family is {self.params('place').family}; grasps that are steered or on a "
-                "table have no families"
+                f"pipeline {self.name}: stage adjust moves the object, which has to stay in sequences, on a table, and "
+                "where poses or the approach are given; use stage ik"
             )
         if not self.realised and (rounds := self.params("domain").rounds) > 1:
             raise ConfigError(
@@ -179,12 +195,11 @@ class Pipeline(_Head):
         Raises:
             ConfigError: a value that cannot be.
         """
-        asked = self.steer.model_dump() | asked
-        return self.model_copy(update={"steer": parse_model(Steering, asked, "steer")}).checked()
+        return self.model_copy(update={"steer": parse_model(Steering, self.steer.model_dump() | asked, "steer")})
 
     def with_table(self) -> "Pipeline":
         """A copy whose grasps leave room for the table that the object rests on."""
-        return self.with_params("place", table=True).checked()
+        return self.with_params("place", table=True)
 
     def with_simulation(self, protocol: str) -> "Pipeline":
         """A copy that keeps only grasps which hold under a protocol of :mod:`lgrasp.simulate.protocol`.

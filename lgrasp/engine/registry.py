@@ -46,6 +46,7 @@ STAGES: dict[str, Stage] = {
     "ik": Stage("ik", "lgrasp.stages.ik", "IkParams"),
     "wrap": Stage("wrap", "lgrasp.stages.wrap", "WrapParams"),
     "search": Stage("search", "lgrasp.stages.search", "SearchParams"),
+    "adjust": Stage("adjust", "lgrasp.stages.adjust", "AdjustParams"),
     "filter": Stage("filter", "lgrasp.stages.filter", "FilterParams"),
     "refine": Stage("refine", "lgrasp.stages.refine", "RefineParams"),
     "hold": Stage("hold", "lgrasp.stages.hold", "HoldParams"),
@@ -58,10 +59,12 @@ SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
 ORDERS = (
     ("place", "domain", "ik", "search", "filter"),
     ("place", "domain", "ik", "wrap", "search", "filter"),
+    ("place", "domain", "ik", "search", "adjust", "filter"),
+    ("place", "domain", "search", "adjust", "filter"),
     ("place", "domain", "search", "ik", "filter"),
 )
-"""Accepted orders: contacts realised before they are combined, fingers perhaps wrapped, or (the published order)
-realised after."""
+"""Accepted orders: contacts realised before they are combined, fingers perhaps wrapped, or realised after: by object and
+fingers together, or (the published order) finger by finger. Of ik and adjust a job runs the one that suits its hand."""
 
 OPTIONAL = ("refine", "hold", "simulate")
 """Stages that may follow, in this order: grasps are refined, tried, simulated."""

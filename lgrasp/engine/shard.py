@@ -20,7 +20,6 @@ from lgrasp.engine.pipeline import Pipeline
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.row_order import RowOrder
-from lgrasp.grasp.schema import MOVES
 from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_rows
 from lgrasp.runtime.ordered import in_order
 from lgrasp.runtime.tally import add_counts, add_seconds, covered
@@ -119,7 +118,7 @@ def _batch_size(
 def shard_effort(pipeline: Pipeline, rows: int) -> int:
     """Candidates that a shard of ``rows`` rows tries before it may give up."""
     steps = -(-max(_LEAST_EFFORT, rows * pipeline.effort) // _EFFORT_STEP)
-    return min(steps * _EFFORT_STEP, _stream(pipeline))
+    return min(steps * _EFFORT_STEP, _STREAM)
 
 
 def gave_up(pipeline: Pipeline, rows: int, found: int, tried: int) -> bool:
@@ -133,12 +132,7 @@ def gave_up(pipeline: Pipeline, rows: int, found: int, tried: int) -> bool:
 
 def _most_effort(pipeline: Pipeline, rows: int) -> int:
     """Candidates that a shard of ``rows`` rows may try."""
-    return min(pipeline.patience * shard_effort(pipeline, rows), _stream(pipeline))
-
-
-def _stream(pipeline: Pipeline) -> int:
-    """Candidates that a shard can have numbers for; with families each needs several."""
-    return _STREAM // MOVES if pipeline.families else _STREAM
+    return min(pipeline.patience * shard_effort(pipeline, rows), _STREAM)
 
 
 def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:

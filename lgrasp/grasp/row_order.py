@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lgrasp.grasp.numbers import origins
+from lgrasp.grasp.schema import POSE_BITS
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.seeding import mixed, stage_seed
 
@@ -28,7 +28,7 @@ class RowOrder:
 
     def by_blocks(self, grasps: GraspTable) -> np.ndarray:
         """Indices (N,) that put blocks one after another, and the rows of each in random order."""
-        block = origins(grasps.index) // self._block
+        block = (grasps.index.astype(np.uint64) & POSE_BITS) // self._block
         return np.argsort(block << _KEY_BITS | self._keys(grasps.index, grasps.slot) >> _BLOCK_BITS)
 
     def _keys(self, index: np.ndarray, slot: np.ndarray) -> np.ndarray:

@@ -18,12 +18,8 @@ MADE_FROM = "made_from"
 """Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
 PASS_SHIFT = 32
 """Bits of the number of a candidate below that of its pass."""
-MOVED_PASS = 64
-"""The first pass of moved poses (:mod:`lgrasp.grasp.numbers`); passes over poses as drawn are fewer."""
-MOST_ROUNDS = (1 << 8) - MOVED_PASS
-"""Passes of moved poses that there may be."""
-MOVES = 32
-"""Poses moved of one candidate that a pass may have."""
+POSE_BITS = (1 << 64) - 1 - (0xFF << PASS_SHIFT)
+"""Bits of the column ``candidate`` that tell the pose that the row was made from; the others are its pass."""
 
 
 @dataclass(frozen=True)

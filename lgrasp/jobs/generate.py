@@ -105,9 +105,7 @@ class GenerateJob(GenerateRequest, SearchJob):
 
     def at_once(self) -> int:
         # on the host a GPU's shard is finished while the next are searched
-        pipeline = self.pipeline
-        again = pipeline.params("search").passes > 1 or pipeline.families
-        alone = self.negatives or self.protocol or again
+        alone = self.negatives or self.protocol or self.pipeline.params("search").passes > 1
         return 1 if alone or not self._graphs else _SHARDS_ON_GPU
 
     def writers(self) -> int:

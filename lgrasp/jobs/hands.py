@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.hand.find import HandSource, find_hand
 from lgrasp.hand.spec_check import check_spaces
@@ -26,15 +28,15 @@ def hand_source(name: str) -> HandSource:
 
 
 def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
-    """A pipeline whose grasp type, sides of links, thumb and pose policy, if asked for, are those of a hand; one line
-    tells where it asks for more contacts than the hand has fingers and palm, and it then asks for so many.
+    """A pipeline whose grasp type, sides of links, thumb and pose policy, if asked for, are those of a hand, with the
+    one of stages ik and adjust that suits its fingers; one line tells where it asks for more contacts than the hand has fingers and palm, and it then asks for so many.
 
     Raises:
         HandError: no such hand.
         ConfigError: see :func:`~lgrasp.steer.typed.typed`, :func:`~lgrasp.steer.typed.asked_sides` and
             :func:`~lgrasp.steer.typed.asked_thumb`; a policy that is none, or of another hand.
     """
-    pipeline = _within_reach(pipeline, hand)
+    pipeline = _within_reach(_suited(pipeline, hand), hand)
     policy, steer = pipeline.params("place").policy, pipeline.steer
     looked_up = steer.grasp_type is not None or steer.thumb is not None or any(steer.sides.values())
     if not looked_up and policy is None:
@@ -62,6 +64,13 @@ def own_policy(pipeline: Pipeline, hand: str) -> Path | None:
     if pipeline.steer.asks or pipeline.on_table:
         return None
     return shipped_policy(hand, pipeline.hand.contact_links)
+
+
+def _suited(pipeline: Pipeline, hand: str) -> Pipeline:
+    if not {"ik", "adjust"} <= {*pipeline.order}:
+        return pipeline
+    source = hand_source(hand)
+    return pipeline.suited(float(np.median(build_tree(read_urdf(source.urdf), source.spec).dof_free)))
 
 
 def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:

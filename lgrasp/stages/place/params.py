@@ -5,7 +5,6 @@ from typing import ClassVar
 from pydantic import Field, field_serializer
 
 from lgrasp.config import Params
-from lgrasp.grasp.schema import MOST_ROUNDS
 from lgrasp.policy.names import SHIPPED, policy_digest
 
 NO_BOUND = 10.0
@@ -55,23 +54,6 @@ class PlaceParams(Params):
         description="Of these one is drawn in proportion to its chance to the power of 1 over this; 0: the likeliest. "
         "More covers more of the ways to hold an object.",
     )
-    family: int = Field(
-        default=1,
-        ge=1,
-        le=1000,
-        description="Poses that are sought about each one that gave a grasp, itself included, by small moves of those "
-        "that did: many more grasps a second where they are rare, and rows that are more alike; 1: none.",
-    )
-    family_rounds: int = Field(
-        default=24, ge=1, le=MOST_ROUNDS, description="Most rounds of moves of a family, of 4, 8, 16, 32, 32 ... poses."
-    )
-    family_move: float = Field(
-        default=0.02,
-        ge=0,
-        le=0.2,
-        description="Standard deviation of a move along an axis in the first round [m]; a fifth in the last.",
-    )
-    family_turn: float = Field(default=20.0, ge=0, le=180, description="The same of a turn about an axis [deg].")
     table: bool = Field(
         default=False, description="The object rests on a table that grasps leave room for, the way to them included."
     )

@@ -1,0 +1,54 @@
+"""Structs of the adjust stage."""
+
+from enum import IntEnum
+
+import warp as wp
+
+
+class AdjustCount(IntEnum):
+    """Counts of the stage."""
+
+    TRIED = 0
+    REACHED = 1
+    KEPT = 2
+
+
+@wp.struct
+class AdjustValues:
+    """AdjustParams and GraspBounds as kernels read them."""
+
+    iterations: wp.int32
+    patience: wp.int32
+    lever: wp.float32  # [m]
+    normal_weight: wp.float32
+    slide_weight: wp.float32
+    depth_weight: wp.float32
+    left_penetration: wp.float32  # [m]
+    damping: wp.float32
+    object_damping: wp.float32
+    step: wp.float32  # [rad or m]
+    object_step: wp.float32  # [m]
+    object_turn: wp.float32  # [rad]
+    contact_indentation: wp.float32  # [m]
+    gap: wp.float32  # [m]
+    cosine: wp.float32  # least, of the normals
+    max_penetration: wp.float32  # [m]
+
+
+@wp.struct
+class Deepest:
+    """Where a body and the object meet deepest."""
+
+    at: wp.vec3  # [m] object's frame
+    away: wp.vec3  # unit vector in which the body leaves the object
+    depth: wp.float32  # [m]
+
+
+@wp.struct
+class Touch:
+    """A contact of a finger: where it is, and how far from being made."""
+
+    local: wp.vec3  # [m] point of the link, body frame
+    out: wp.vec3  # outward normal there
+    gap: wp.float32  # [m] of the link's surface to the object's point
+    beside: wp.int32  # 1: the object's point lies beside the face of the link that is to touch
