@@ -103,7 +103,7 @@ class Pipeline(_Head):
         """A copy with one of stages ik and adjust where the pipeline has both.
 
         Args:
-            joints: of their own that half the fingers of the hand have at most.
+            joints: of its own that a finger of the hand has on the mean.
         """
         if not {"ik", "adjust"} <= {*self.order}:
             return self
@@ -111,8 +111,9 @@ class Pipeline(_Head):
         return self.without("ik" if adjusts else "adjust")
 
     def without(self, stage: str) -> "Pipeline":
-        """A copy that lacks a stage; without ik contacts are drawn once."""
-        kept = self.model_copy(update={"stages": tuple(s for s in self.stages if s[0] != stage)})
+        """A copy that lacks a stage; without ik contacts are drawn once, and fingers are not wrapped."""
+        left_out = {stage, "wrap"} if stage == "ik" else {stage}
+        kept = self.model_copy(update={"stages": tuple(s for s in self.stages if s[0] not in left_out)})
         return kept.with_params("domain", rounds=1) if stage == "ik" and stage in self.order else kept
 
     def with_bounds(self, **changes: Any) -> "Pipeline":
@@ -193,13 +194,14 @@ class Pipeline(_Head):
         """A copy whose grasps obey more of :class:`~lgrasp.steer.params.Steering`.
 
         Raises:
-            ConfigError: a value that cannot be.
+            ConfigError: a value that cannot be, or stages that cannot obey.
         """
-        return self.model_copy(update={"steer": parse_model(Steering, self.steer.model_dump() | asked, "steer")})
+        steer = parse_model(Steering, self.steer.model_dump() | asked, "steer")
+        return self.model_copy(update={"steer": steer}).checked()
 
     def with_table(self) -> "Pipeline":
         """A copy whose grasps leave room for the table that the object rests on."""
-        return self.with_params("place", table=True)
+        return self.with_params("place", table=True).checked()
 
     def with_simulation(self, protocol: str) -> "Pipeline":
         """A copy that keeps only grasps which hold under a protocol of :mod:`lgrasp.simulate.protocol`.

@@ -59,12 +59,13 @@ SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
 ORDERS = (
     ("place", "domain", "ik", "search", "filter"),
     ("place", "domain", "ik", "wrap", "search", "filter"),
-    ("place", "domain", "ik", "search", "adjust", "filter"),
     ("place", "domain", "search", "adjust", "filter"),
     ("place", "domain", "search", "ik", "filter"),
+    ("place", "domain", "ik", "search", "adjust", "filter"),
+    ("place", "domain", "ik", "wrap", "search", "adjust", "filter"),
 )
-"""Accepted orders: contacts realised before they are combined, fingers perhaps wrapped, or realised after: by object and
-fingers together, or (the published order) finger by finger. Of ik and adjust a job runs the one that suits its hand."""
+"""Accepted orders: contacts realised before they are combined, fingers perhaps wrapped; or after, by object and fingers
+together, or (the published order) finger by finger. Of ik and adjust a job leaves the one that suits its hand."""
 
 OPTIONAL = ("refine", "hold", "simulate")
 """Stages that may follow, in this order: grasps are refined, tried, simulated."""

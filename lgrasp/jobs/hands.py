@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.hand.find import HandSource, find_hand
 from lgrasp.hand.spec_check import check_spaces
@@ -29,7 +27,8 @@ def hand_source(name: str) -> HandSource:
 
 def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
     """A pipeline whose grasp type, sides of links, thumb and pose policy, if asked for, are those of a hand, with the
-    one of stages ik and adjust that suits its fingers; one line tells where it asks for more contacts than the hand has fingers and palm, and it then asks for so many.
+    one of stages ik and adjust that suits its fingers; one line tells where it asks for more contacts than the hand has
+    fingers and palm, and it then asks for so many.
 
     Raises:
         HandError: no such hand.
@@ -70,7 +69,7 @@ def _suited(pipeline: Pipeline, hand: str) -> Pipeline:
     if not {"ik", "adjust"} <= {*pipeline.order}:
         return pipeline
     source = hand_source(hand)
-    return pipeline.suited(float(np.median(build_tree(read_urdf(source.urdf), source.spec).dof_free)))
+    return pipeline.suited(float(build_tree(read_urdf(source.urdf), source.spec).dof_free.mean()))
 
 
 def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:

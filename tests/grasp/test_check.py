@@ -17,6 +17,7 @@ from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.outcomes import METRICS, REASONS, Outcome
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.find import find_hand
+from lgrasp.jobs.hands import for_hand
 from lgrasp.runtime.device import resolve_device
 from lgrasp.stages.context import Context
 
@@ -59,10 +60,11 @@ def hand_inputs(hand, cache_root) -> Inputs:
 
 
 @pytest.fixture(scope="module")
-def robust(hand_inputs) -> tuple[Context, GraspTable]:
+def robust(hand, hand_inputs) -> tuple[Context, GraspTable]:
     """Rows of the first candidates of the default pipeline."""
-    context = replace(shard_context(ROBUST, hand_inputs, 0), field=replace(hand_inputs.field, boxes=None))
-    return context, run_stages(ROBUST, context, 0, PIPELINES["robust"], "filter")
+    pipeline = for_hand(ROBUST, hand)
+    context = replace(shard_context(pipeline, hand_inputs, 0), field=replace(hand_inputs.field, boxes=None))
+    return context, run_stages(pipeline, context, 0, PIPELINES["robust"], "filter")
 
 
 def rechecked(context: Context, table, bounds: GraspBounds):
@@ -76,7 +78,7 @@ def test_slices_of_bodies_give_the_same_rows(hand, robust, monkeypatch):
     assert depth_slices("cpu") == 1
     for module in ("lgrasp.grasp.check", "lgrasp.stages.search.stage"):
         monkeypatch.setattr(f"{module}.depth_slices", lambda device: 8)
-    sliced = run_stages(ROBUST, context, 0, PIPELINES["robust"], "filter")
+    sliced = run_stages(for_hand(ROBUST, hand), context, 0, PIPELINES["robust"], "filter")
     assert len(whole) > 0 or (hand, "robust") in FEW
     np.testing.assert_array_equal(sliced.q, whole.q)
     np.testing.assert_array_equal(sliced.metrics["penetration"], whole.metrics["penetration"])
@@ -84,7 +86,7 @@ def test_slices_of_bodies_give_the_same_rows(hand, robust, monkeypatch):
 
 @pytest.mark.parametrize("name", PIPELINES)
 def test_every_row_of_a_pipeline_passes(hand, name, hand_inputs, robust):
-    pipeline = load_pipeline(name)
+    pipeline = for_hand(load_pipeline(name), hand)
     if (hand, name) not in MORE:
         pipeline = pipeline.with_settings(SMALLER.get(name, ()))
     if name == "robust":

@@ -53,7 +53,7 @@ def test_options(cli, tmp_path, changes, words, quick):
 
 def test_a_stage_that_the_pipeline_lacks(cli):
     error = cli("hold", "--object", "tiny", "--pipeline", "robust").error()
-    assert "pipeline robust has no stage hold; its stages: place, domain, ik, search, filter" in error
+    assert "pipeline robust has no stage hold; its stages: place, domain, ik, search, adjust, filter" in error
 
 
 def test_unknown_command(cli):

@@ -51,6 +51,46 @@ def _slid(hand: Hand, grid: wp.int32, touch: Touch, target: wp.vec3):
 
 
 @wp.func
+def _made(hand: Hand, params: AdjustValues, grid: wp.int32, touch: Touch, facing: wp.float32):
+    """True if a contact is made; ``facing`` is the cosine of its normals."""
+    there = touch.beside == 0 and wp.abs(touch.gap + params.contact_indentation) <= params.gap
+    return there and facing >= params.cosine and contact_allowed(hand.contacts, grid, touch.out)
+
+
+@wp.func
+def _is_near(params: AdjustValues, touch: Touch, facing: wp.float32):
+    """True if a contact may yet be made."""
+    off = wp.abs(touch.gap + params.contact_indentation)
+    return touch.beside == 0 and off <= _NEAR and facing >= _NEAR_COSINE
+
+
+@wp.func
+def _looseness(params: AdjustValues, touch: Touch):
+    """Weight of the offset along the face: a contact slides on its face, and comes back from beside it."""
+    return wp.where(touch.beside == 1, 1.0, params.slide_weight)
+
+
+@wp.func
+def _add_object_rows(
+    equations: wp.array(dtype=vec6),
+    params: AdjustValues,
+    touch: Touch,
+    p: wp.vec3,
+    n: wp.vec3,
+    target: wp.vec3,
+    centre: wp.vec3,
+    normal: wp.vec3,
+):
+    """What a contact at p with normal n asks of the object's motion about ``centre``, base frame."""
+    w = params.normal_weight * params.lever
+    aim = p - n * params.contact_indentation - target
+    arm = target - centre
+    add_distance(equations, motion_row(n, arm), wp.dot(n, aim), 1.0)
+    add_offset(equations, arm, aim, _looseness(params, touch))
+    add_turn(equations, normal, normal - n, w * w)
+
+
+@wp.func
 def _begin(sets: Sets, candidates: Candidates, i: wp.int32, moved_out: Candidates):
     """Copies a set: one candidate of each group that touches."""
     row = sets.pose[i]
@@ -154,6 +194,10 @@ def _adjusting(size: int) -> Any:
                 k = field.point[moved_out.record[i, g, 0]]
                 touches[g].local = hand.contacts.points[k]
                 touches[g].out = hand.contacts.normals[k]
+        on_palm = Touch()
+        if palm >= 0:
+            on_palm.local = hand.contacts.points[palm]
+            on_palm.out = hand.contacts.normals[palm]
         met = bool(False)
         whole = bool(False)
         both = bool(False)
@@ -179,13 +223,9 @@ def _adjusting(size: int) -> Any:
                     touches[g] = touch
                     n = wp.transform_vector(X[body], touch.out)
                     p = wp.transform_point(X[body], touch.local)
-                    off = wp.abs(touch.gap + params.contact_indentation)
                     facing = wp.dot(n, normal)
-                    there = touch.beside == 0 and off <= params.gap and facing >= params.cosine
-                    if not there or not contact_allowed(hand.contacts, grid, touch.out):
-                        met = False
-                    if touch.beside == 1 or off > _NEAR or facing < _NEAR_COSINE:
-                        near = False
+                    met = met and _made(hand, params, grid, touch, facing)
+                    near = near and _is_near(params, touch, facing)
                     for a in range(size):
                         V[a] = wp.vec3()
                         R[a] = wp.vec3()
@@ -200,7 +240,7 @@ def _adjusting(size: int) -> Any:
                     aim = p - n * params.contact_indentation - target
                     turn = normal - n
                     arm = target - centre
-                    loose = wp.where(touch.beside == 1, 1.0, params.slide_weight)
+                    loose = _looseness(params, touch)
                     row = motion_row(n, arm)
                     A = square()
                     b = column()
@@ -212,9 +252,7 @@ def _adjusting(size: int) -> Any:
                         for c in range(a + 1):
                             A[a, c] = along * wp.dot(V[c], n) + loose * wp.dot(V[a], V[c]) + w2 * wp.dot(R[a], R[c])
                         A[a, a] = A[a, a] + params.damping
-                    add_distance(equations, row, wp.dot(n, aim), 1.0)
-                    add_offset(equations, arm, aim, loose)
-                    add_turn(equations, normal, turn, w2)
+                    _add_object_rows(equations, params, touch, p, n, target, centre, normal)
                     bodies = wp.where(it < _FIRST_DEPTH, 0, hand.kin.joint_first[g + 1] - j0)
                     for other in range(bodies):
                         least = params.left_penetration
@@ -241,15 +279,12 @@ def _adjusting(size: int) -> Any:
                             add_distance(equations, row, aimed, params.depth_weight)
                     eliminate(A, b, mixed, own, g, equations)
             if palm >= 0:
-                s = moved_out.poses.palm_surface[i]
-                target = wp.transform_point(T, obj.contact_points[s])
-                normal = -wp.transform_vector(T, obj.contact_normals[s])
-                n = hand.contacts.normals[palm]
-                aim = hand.contacts.points[palm] - n * params.contact_indentation - target
-                add_offset(equations, target - centre, aim, 1.0)
-                add_turn(equations, normal, normal - n, w2)
-                if wp.length(aim) > params.gap or wp.dot(n, normal) < params.cosine:
-                    met = False
+                target = wp.transform_point(T, obj.contact_points[moved_out.poses.palm_surface[i]])
+                normal = -wp.transform_vector(T, obj.contact_normals[moved_out.poses.palm_surface[i]])
+                on_palm = _slid(hand, hand.contacts.grid[palm], on_palm, target)
+                _add_object_rows(equations, params, on_palm, on_palm.local, on_palm.out, target, centre, normal)
+                met = met and _made(hand, params, hand.contacts.grid[palm], on_palm, wp.dot(on_palm.out, normal))
+                near = near and _is_near(params, on_palm, wp.dot(on_palm.out, normal))
             deep = deepest_point(hand, obj, 0, T_object, params.left_penetration, both)
             deepest = wp.max(deepest, deep.depth)
             if deep.depth > params.left_penetration:

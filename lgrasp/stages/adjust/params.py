@@ -9,19 +9,19 @@ from lgrasp.stages.least_squares import Damping, Gap, JointStep
 class AdjustParams(Params):
     """How object and fingers move together until the contacts of a set are made; lengths in metres."""
 
-    joints: int = Field(
-        default=3,
+    joints: float = Field(
+        default=3.0,
         ge=0,
         le=8,
-        description="Where a pipeline has stage ik as well: hands of which half the fingers have no more joints of "
-        "their own than this are adjusted, fingers of others move alone, by ik.",
+        description="Where a pipeline has stage ik as well: hands whose fingers have no more joints of their own than "
+        "this on the mean are adjusted, without ik; fingers of others move alone, by ik.",
     )
     iterations: int = Field(default=20, ge=1, le=200, description="Most damped least-squares steps.")
     patience: int = Field(
         default=4, ge=0, le=200, description="Steps after which a set is given up while its contacts are far."
     )
     lever: float = Field(default=0.01, gt=0, le=0.1, description="Length that makes turns comparable to distances.")
-    normal_weight: float = Field(default=0.15, gt=0, le=10, description="Weight of the contacts' normals.")
+    normal_weight: float = Field(default=0.15, gt=0, le=10, description="Weight of the angle of normals at contacts.")
     slide_weight: float = Field(default=0.05, gt=0, le=1, description="Weight of contacts that slide along a link.")
     depth_weight: float = Field(
         default=3.0, ge=0, le=100, description="Weight of the deepest point of each body in the object."
