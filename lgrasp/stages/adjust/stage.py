@@ -4,13 +4,15 @@ import math
 
 import warp as wp
 
+from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.tables import CandidateTable, ContactSets, PoseTable, trim_sets
 from lgrasp.runtime.scan import running_sums
-from lgrasp.runtime.structs import make_struct
+from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
-from lgrasp.stages.adjust.kernels import adjust_sets, take_whole
+from lgrasp.stages.adjust.depth import find_depths
+from lgrasp.stages.adjust.kernels import FIRST_DEPTH, begin_sets, check_thumbs, step_sets, take_whole
 from lgrasp.stages.adjust.params import AdjustParams
-from lgrasp.stages.adjust.structs import AdjustCount, AdjustValues
+from lgrasp.stages.adjust.structs import AdjustCount, Adjusted, AdjustValues, Deepest, Touch
 from lgrasp.stages.context import Context
 
 VERSION = 1
@@ -24,7 +26,7 @@ def run(inputs: ContactSets, params: AdjustParams, context: Context) -> tuple[Co
 
     Returns:
         The sets whose contacts are made and whose fingers are clear of the object, each with a pose of its own, and
-        counts ``tried``, ``reached`` (gaps and normals met), ``kept``.
+        counts ``tried``, ``kept``.
     """
     d, inputs = context.device, trim_sets(inputs)
     tally, n, groups = empty_tally(AdjustCount, d), inputs.pose.shape[0], context.hand.model.groups
@@ -34,11 +36,20 @@ def run(inputs: ContactSets, params: AdjustParams, context: Context) -> tuple[Co
     kept = ContactSets.empty(d, *inputs.chosen.shape, candidates=table)
     angles = {"cosine": math.cos(math.radians(params.angle)), "object_turn": math.radians(params.object_turn)}
     values = make_struct(AdjustValues, params, context.bounds, **angles)
+    hand, obj, field = context.hand.struct, context.object.struct, context.field.struct
+    parts, bodies = depth_slices(d), len(context.hand.model.piece_first) - 1
+    given = {"touch": wp.empty((n, groups + 1), dtype=Touch, device=d)}
+    given["deepest"] = wp.empty((n, bodies, parts), dtype=Deepest, device=d)
+    moving = empty_struct(Adjusted, d, n, **given)
+    wp.launch(begin_sets, n, [field, hand, inputs.struct, inputs.candidates.struct], [table.struct, moving], device=d)
+    step = step_sets[context.hand.model.tree.dof_size]
+    for it in range(params.iterations + 1 if n else 0):
+        if it >= int(FIRST_DEPTH):
+            shape = (n, bodies, parts)
+            wp.launch(find_depths, shape, [hand, obj, values, table.struct, parts], [moving], device=d)
+        wp.launch(step, n, [hand, field, obj, values, it], [table.struct, moving], device=d)
     upto = wp.empty(n, dtype=wp.int32, device=d)
-    asked = [context.hand.struct, context.field.struct, context.object.struct, values]
-    kernel = adjust_sets[context.hand.model.tree.dof_size]
-    outputs = [table.struct, upto, tally.device]
-    wp.launch(kernel, n, [*asked, inputs.struct, inputs.candidates.struct], outputs, device=d)
+    wp.launch(check_thumbs, n, [hand, table.struct, moving], [upto], device=d)
     running_sums(upto)
-    wp.launch(take_whole, n, [upto, inputs.struct], [kept.struct], device=d)
+    wp.launch(take_whole, n, [upto, inputs.struct], [kept.struct, tally.device], device=d)
     return kept, tally

@@ -5,12 +5,19 @@ from enum import IntEnum
 import warp as wp
 
 
+class Progress(IntEnum):
+    """What has become of a set."""
+
+    GOING = 0
+    WHOLE = 1  # every contact is made, nothing sinks in
+    GIVEN_UP = -1
+
+
 class AdjustCount(IntEnum):
     """Counts of the stage."""
 
     TRIED = 0
-    REACHED = 1
-    KEPT = 2
+    KEPT = 1
 
 
 @wp.struct
@@ -52,3 +59,13 @@ class Touch:
     out: wp.vec3  # outward normal there
     gap: wp.float32  # [m] of the link's surface to the object's point
     beside: wp.int32  # 1: the object's point lies beside the face of the link that is to touch
+
+
+@wp.struct
+class Adjusted:
+    """S sets on their way; B bodies, the base first, each looked at in K slices."""
+
+    progress: wp.array(dtype=wp.int32)  # (S,) Progress
+    both: wp.array(dtype=wp.int32)  # (S,) 1: penetration is looked at both ways
+    touch: wp.array2d(dtype=Touch)  # (S, G + 1) contact of each group, the palm's last
+    deepest: wp.array3d(dtype=Deepest)  # (S, B, K) of bodies whose fingers touch, and of the base
