@@ -111,9 +111,8 @@ class Pipeline(_Head):
         return self.without("ik" if adjusts else "adjust")
 
     def without(self, stage: str) -> "Pipeline":
-        """A copy that lacks a stage; without ik contacts are drawn once, and fingers are not wrapped."""
-        left_out = {stage, "wrap"} if stage == "ik" else {stage}
-        kept = self.model_copy(update={"stages": tuple(s for s in self.stages if s[0] not in left_out)})
+        """A copy that lacks a stage; without ik contacts are drawn once."""
+        kept = self.model_copy(update={"stages": tuple(s for s in self.stages if s[0] != stage)})
         return kept.with_params("domain", rounds=1) if stage == "ik" and stage in self.order else kept
 
     def with_bounds(self, **changes: Any) -> "Pipeline":

@@ -62,7 +62,6 @@ ORDERS = (
     ("place", "domain", "search", "adjust", "filter"),
     ("place", "domain", "search", "ik", "filter"),
     ("place", "domain", "ik", "search", "adjust", "filter"),
-    ("place", "domain", "ik", "wrap", "search", "adjust", "filter"),
 )
 """Accepted orders: contacts realised before they are combined, fingers perhaps wrapped; or after, by object and fingers
 together, or (the published order) finger by finger. Of ik and adjust a job leaves the one that suits its hand."""
