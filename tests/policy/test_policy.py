@@ -15,7 +15,7 @@ from lgrasp.grasp.structs import Poses
 from lgrasp.grasp.tables import CandidateTable, PoseTable
 from lgrasp.hand.arrays import Hand
 from lgrasp.jobs.hands import for_hand
-from lgrasp.jobs.learn.examples import seen_contacts, seen_reach
+from lgrasp.jobs.learn.examples import make_pose_examples, seen_contacts, seen_reach
 from lgrasp.learn.params import PosePolicyParams
 from lgrasp.learn.policy import PoseNet, Seen, fit_network, ranking, rate
 from lgrasp.math.limits import MAX_GROUPS
@@ -222,3 +222,15 @@ def test_shipped_policies_are_of_their_hands(swift):
     for name in ("allegro", "leap", "shadow"):
         assert for_hand(power, name).params("place").policy.endswith(f"{name}/power_policy.npz")
     assert for_hand(asked.with_table(), "allegro").params("place").policy is None
+
+
+def test_examples_where_objects_are_adjusted(swift, inputs):
+    """Poses that gave grasps are those of the pipeline's rows, though the object moved from there."""
+    robust = load_pipeline("robust").model_copy(update={"field": swift.field})
+    adjusting = robust.without("ik")
+    context = shard_context(adjusting, inputs, 0)
+    params = PosePolicyParams.model_validate({"candidates": 512, "failures": 1.0, "draws": 1})
+    examples = make_pose_examples(adjusting, robust.without("adjust"), context, np.zeros((POINTS, 3)), params)
+    assert len(examples.contacts_yields) > 300
+    assert examples.contacts_yields.sum() == len(np.unique(run_stages(adjusting, context, 0, 512, "filter").index)) > 3
+    assert examples.contacts.count.max() > 0

@@ -52,38 +52,47 @@ def reach_points(field: ContactField, seed: int) -> np.ndarray:
 
 
 def make_pose_examples(
-    pipeline: Pipeline, context: Context, points: np.ndarray, params: PosePolicyParams
+    pipeline: Pipeline, realising: Pipeline, context: Context, points: np.ndarray, params: PosePolicyParams
 ) -> PoseExamples:
     """Search poses of the context's object to the end, and tell what is seen at those that gave a grasp and at a share
     of the others.
 
     Args:
+        realising: by whose stage ik contacts are realised for the second network.
         points: of the policy, (M, 3) base frame [m].
     """
     most = _GPU_BATCH if context.device.startswith("cuda") else _CPU_BATCH
     parts = [
-        _batch(pipeline, context, points, params, first, min(most, params.candidates - first))
+        _batch(pipeline, realising, context, points, params, first, min(most, params.candidates - first))
         for first in range(0, params.candidates, most)
     ]
     return join_examples(parts)
 
 
 def _batch(
-    pipeline: Pipeline, context: Context, points: np.ndarray, params: PosePolicyParams, first: int, count: int
+    pipeline: Pipeline,
+    realising: Pipeline,
+    context: Context,
+    points: np.ndarray,
+    params: PosePolicyParams,
+    first: int,
+    count: int,
 ) -> PoseExamples:
     meter = Meter(context.device)
     poses = run_stage("place", (first, count), pipeline, context, meter)
     index = to_numpy(poses.index)[: len(poses)]
     table: Any = poses
-    once = pipeline.with_params("domain", rounds=1)
+    once = realising.with_params("domain", rounds=1)
     for stage in ("domain", "ik"):
         table = run_stage(stage, table, once, context, meter)
     early = select_poses(table, np.arange(len(index)), context.device)  # later rounds write where the first did
-    for number in range(1, pipeline.params("domain").rounds):
-        for stage in ("domain", "ik"):
-            table = run_stage(stage, table, once, context.changed(round=number), meter)
-    order, found = pipeline.order, table
-    for stage in order[order.index("ik") + 1 : order.index("filter") + 1]:
+    order, found, last = pipeline.order, poses, "place"
+    if pipeline.realised:
+        for number in range(1, pipeline.params("domain").rounds):
+            for stage in ("domain", "ik"):
+                table = run_stage(stage, table, once, context.changed(round=number), meter)
+        found, last = table, "ik"
+    for stage in order[order.index(last) + 1 : order.index("filter") + 1]:
         found = run_stage(stage, found, pipeline, context, meter)
     yields = np.isin(index, found.index)
     drawn = np.random.default_rng((context.base_seed, context.shard, first)).random(len(index))

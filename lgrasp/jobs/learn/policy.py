@@ -134,8 +134,9 @@ class PolicyJob(PolicyRequest, FileJob):
         p, alias = self.params, self.device_used.alias
         obj = upload_object(self._object(number), alias)
         learned = self.learned
-        context = Context(self._hand, obj, self._field, alias, p.seed, number, bounds=learned.bounds)
-        return make_pose_examples(learned, context, points, p)
+        own = {"bounds": learned.bounds, "realised": learned.realised}
+        context = Context(self._hand, obj, self._field, alias, p.seed, number, **own)
+        return make_pose_examples(learned, self.pipeline.without("adjust"), context, points, p)
 
     def _object(self, number: int) -> ObjectModel:
         params, alias = self.pipeline.object, self.device_used.alias
