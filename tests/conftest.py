@@ -16,6 +16,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from support.kernels import compile_together
+from support.pictures import PLAIN
 
 from lgrasp import notices
 from lgrasp.config import parse_model
@@ -249,11 +250,9 @@ def _unsynced() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _plain_pictures() -> Iterator[None]:
-    """One ray through a pixel, small pictures in reports: they show the same in an eighth of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lgrasp.dataset.report.write._SIZE", 48)
-        for name in ("_SAMPLES", "_RAYS"):
-            patch.setattr(f"lgrasp.picture.draw.{name}", 1)
+        for name, value in PLAIN.items():
+            patch.setattr(name, value)
         yield
 
 
