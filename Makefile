@@ -63,7 +63,7 @@ format: setup
 type: setup
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# WORKERS test files run side by side, each on one thread, in their order (few of the last are long);
+# WORKERS test files run side by side, each on one thread, in their order (the longest first, few of the last are long);
 # a crash ends the run. Tests start hundreds of processes: bytecode is kept.
 pytest: setup
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --max-worker-restart 0
