@@ -6,10 +6,11 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
 # Python compiles what is imported; compiling every file of every package takes long.
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
-# pip reads the index and unpacks one package at a time; uv takes several at once, so that it installs all pinned versions
-# but torch, which pip finds where the user keeps it. Where uv cannot reach the index, pip does it all. Then pip has little
-# to look up. Python 3.11 keeps the setuptools that it has.
-UV := $(BIN)/uv pip install --quiet --python $(BIN)/python $(if $(PIP_INDEX_URL),--default-index $(PIP_INDEX_URL)) -c constraints.txt
+# pip reads the index and unpacks one package at a time; uv takes several at once and installs all pinned versions but
+# torch, which pip finds where the user keeps it. Where uv cannot, pip does it all. Then pip has little to look up.
+# Python 3.11 keeps the setuptools that it has.
+INDEX := $(if $(PIP_INDEX_URL),--default-index $(PIP_INDEX_URL))
+UV := $(BIN)/uv pip install --quiet --python $(BIN)/python $(INDEX) -c constraints.txt
 # The viewer is tested in chromium, where there is one.
 CHROMIUM := $(shell command -v chromium 2>/dev/null)
 BROWSER := playwright greenlet
