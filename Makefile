@@ -6,13 +6,15 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
 # Python compiles what is imported; compiling every file of every package takes long.
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
-# pip reads the index and unpacks one package at a time: the pinned versions come in two lists beside each other first,
-# half of all bytes in each; then it has little to look up. Python 3.11 keeps the setuptools that it has.
-LARGE := torch warp-lang usd-core pyright sympy numpy matplotlib
+# pip reads the index and unpacks one package at a time; uv takes several at once and installs all pinned versions but
+# torch, which pip finds where the user keeps it. Where uv cannot, pip does it all. Then pip has little to look up.
+# Python 3.11 keeps the setuptools that it has.
+INDEX := $(if $(PIP_INDEX_URL),--default-index $(PIP_INDEX_URL))
+UV := $(BIN)/uv pip install --quiet --python $(BIN)/python $(INDEX) -c constraints.txt
 # The viewer is tested in chromium, where there is one.
 CHROMIUM := $(shell command -v chromium 2>/dev/null)
 BROWSER := playwright greenlet
-OTHERS := $(filter-out $(LARGE) setuptools $(if $(CHROMIUM),,$(BROWSER)),$(shell sed -n 's/==.*//p' constraints.txt))
+OTHERS := $(filter-out torch setuptools $(if $(CHROMIUM),,$(BROWSER)),$(shell sed -n 's/==.*//p' constraints.txt))
 
 # The first of these that is Python 3.11 or 3.12; or say which: make setup PYTHON=/path/to/python
 ifndef PYTHON
@@ -35,7 +37,8 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "lgrasp needs Python 3.11 or 3.12; give its path: make setup PYTHON=..." >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) --no-deps $(LARGE) & large=$$!; $(PIP) --no-deps $(OTHERS) && wait $$large
+	$(PIP) --no-deps torch & torch=$$!; \
+	$(PIP) --no-deps uv && $(UV) --no-deps $(OTHERS) || $(PIP) --no-deps $(OTHERS) && wait $$torch
 	$(PIP) --no-build-isolation -e ".[dev,sim$(if $(CHROMIUM),$(comma)browser)]"
 	@touch $@
 
@@ -61,7 +64,7 @@ format: setup
 type: setup
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# WORKERS test files run side by side, each on one thread, in their order (few of the last are long);
+# WORKERS test files run side by side, each on one thread, in their order (the longest first, few of the last are long);
 # a crash ends the run. Tests start hundreds of processes: bytecode is kept.
 pytest: setup
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --max-worker-restart 0

@@ -16,6 +16,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from support.kernels import compile_together
+from support.pictures import PLAIN
 
 from lgrasp import notices
 from lgrasp.config import parse_model
@@ -34,6 +35,7 @@ from lgrasp.stages.context import Context
 OBJECT = "mug"
 RECORDS = 20_000
 CANDIDATES = 2000
+LONGEST = "test_aot.py"
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -45,8 +47,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """All processes have the same order."""
-    items.sort(key=lambda item: item.path.parts)
+    """All processes have the same order: by path, but the longest file first, so that no process waits for it."""
+    items.sort(key=lambda item: (item.path.name != LONGEST, item.path.parts))
 
 
 def _collected(path: Path) -> bool:
@@ -249,11 +251,9 @@ def _unsynced() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _plain_pictures() -> Iterator[None]:
-    """One ray through a pixel, small pictures in reports: they show the same in an eighth of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lgrasp.dataset.report.write._SIZE", 48)
-        for name in ("_SAMPLES", "_RAYS"):
-            patch.setattr(f"lgrasp.picture.draw.{name}", 1)
+        for name, value in PLAIN.items():
+            patch.setattr(name, value)
         yield
 
 

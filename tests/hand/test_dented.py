@@ -20,7 +20,9 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.self_collision import OVERLAP, overlap_depth
 from lgrasp.hand.surface import joined_mesh
 from lgrasp.hand.urdf import Geometry, Urdf, read_urdf
-from lgrasp.runtime.device import start
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 
 @wp.kernel

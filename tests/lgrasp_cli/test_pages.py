@@ -1,5 +1,5 @@
-"""README, quickstart and the page on steering run as written, but with fewer rows, in an empty folder; the first two
-with what a wheel installs."""
+"""README, quickstart and the page on steering run as written, but with fewer rows and plain pictures, in an empty
+folder; the first two with what a wheel installs."""
 
 import json
 import os
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from support.pictures import PLAIN
 from support.places import ROOT
 
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -20,10 +21,16 @@ FEWER = {"generate": ("-n", "4"), "render": ("-n", "2")}
 
 SCRIPT = """
 import json, os, sys
+from importlib import import_module
 import lgrasp
 from lgrasp_cli.main import main
 print(lgrasp.__file__)
-for page, commands in json.load(sys.stdin).items():
+pages, pictures = json.load(sys.stdin)
+for name, value in pictures.items():
+    module, _, attribute = name.rpartition(".")
+    assert hasattr(import_module(module), attribute)
+    setattr(import_module(module), attribute, value)
+for page, commands in pages.items():
     os.makedirs(page)
     os.chdir(page)
     for words in commands:
@@ -92,7 +99,12 @@ def test_pages_run_with_a_wheel(installed, shared_cache, tmp_path):
     env |= {"PYTHONPATH": str(installed), "LGRASP_CACHE_DIR": str(shared_cache)}
     env["WARP_CACHE_PATH"] = str(Path(wp.config.kernel_cache_dir).parent)  # Warp adds its version
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], input=json.dumps(ran), env=env, cwd=tmp_path, capture_output=True, text=True
+        [sys.executable, "-c", SCRIPT],
+        input=json.dumps([ran, PLAIN]),
+        env=env,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(str(installed))

@@ -6,6 +6,9 @@ import trimesh
 import warp as wp
 
 from lgrasp.math.triangles import least_facing
+from lgrasp.runtime.device import KERNEL_OPTIONS
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 
 @wp.kernel

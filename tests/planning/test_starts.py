@@ -65,9 +65,9 @@ def test_tilted_directions_lean_by_their_angle_to_all_sides():
     np.testing.assert_allclose(around.sum(0), 0, atol=1e-12)
 
 
-def test_a_hand_without_a_palm_faces_its_box():
+def test_a_hand_without_a_palm_faces_its_box(cache_root):
     device = resolve_device("cpu")
-    source, dclaw = named_hand(Cache(), "dclaw", device)
+    source, dclaw = named_hand(Cache(cache_root, pytest.fail), "dclaw", device)
     centre, facing = palm_axis(dclaw)
     np.testing.assert_allclose(facing, [1, 0, 0], atol=0.01)  # fingers along +x
     assert np.linalg.norm(centre) < 0.02

@@ -22,9 +22,12 @@ from lgrasp.math.limits import MAX_GROUPS
 from lgrasp.object.arrays import Object
 from lgrasp.policy.arrays import Network, upload_policy
 from lgrasp.policy.model import MOST_HITS, POINTS, policy_bytes, read_policy
+from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.domain.chance_kernels import BLOCK, drop_unlikely, rate_contacts
 from lgrasp.stages.place.observe import observe_reach
 from lgrasp.stages.place.rating import MAX_HITS, chance_of, find_reach
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 CANDIDATES = 2 * BLOCK
 

@@ -10,10 +10,13 @@ from lgrasp.engine.batch import run_stages
 from lgrasp.math.frictionless import frictionless
 from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.math.transforms import tangent
+from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 from lgrasp.stages.search.params import MAX_RESTARTS, SearchParams
 from lgrasp.stages.search.stage import run
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 PARAMS = SearchParams(
     method="mutate", contacts=(3,), threshold=1.0, restarts=2, per_pose=2, separation=0.0, sweeps=2, mutations=6

@@ -28,10 +28,13 @@ from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
+from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 from lgrasp.stages.wrap.params import WrapParams
 from lgrasp.stages.wrap.stage import run
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 RADIUS, HALF, LENGTH = 0.03, 0.0075, 0.06  # [m] of the cylinder, half a link's thickness, from hinge to hinge
 TANGENT = 0.035  # [m] from the first hinge to the contact
