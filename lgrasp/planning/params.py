@@ -13,7 +13,7 @@ _CLOUD_GAP = 6.0e-3  # [m]
 _FEW_FINGERS = 3
 _DRAWN_ROUNDS = 16  # 20 give no more plans that hold, 12 a few fewer
 _PLAN_BOUNDS = GraspBounds(profile="plan")
-_DRAWN_BOUNDS = {"squeeze_force": 40.0, "min_hold_probability": 0.75}  # [N]; six of eight draws
+_DRAWN_HOLD = 0.75  # six of eight draws
 
 
 class Effort(NamedTuple):
@@ -105,31 +105,23 @@ class PlanParams(Params):
         description="Least share of the draws in which a hand that is tried must hold to be a plan, above 0 also in "
         "the trial without; default: that of `bounds` if it has one, else 0.75 for 24 that a network draws.",
     )
-    squeeze_force: float | None = Field(
-        default=None,
-        ge=0,
-        le=1000,
-        description="Normal forces together that q_squeeze presses with [N]; default: that of `bounds` if it is not "
-        "the profile's, else 40 for 24 that a network draws.",
-    )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
     def effort(self, fingers: int | None) -> Effort:
         """For hands with so many fingers that a network draws, or open ones (None)."""
         own: dict[str, Any] = {"draws": 1, "finalists": 10, "tried": 10}
-        own |= {"matching_rounds": self.search.matching_rounds}
-        bounds = {name: getattr(self.bounds, name) for name in _DRAWN_BOUNDS}
+        own["matching_rounds"] = self.search.matching_rounds
+        own["min_hold_probability"] = least = self.bounds.min_hold_probability
         if fingers is not None and fingers <= _FEW_FINGERS:
             own |= {"draws": 40, "finalists": 24, "tried": 8}
         elif fingers is not None:
             own |= {"draws": 24, "finalists": 12, "tried": 8, "matching_rounds": _DRAWN_ROUNDS}
-            bounds |= {name: x for name, x in _DRAWN_BOUNDS.items() if bounds[name] == getattr(_PLAN_BOUNDS, name)}
-        for numbers in (own, bounds):
-            numbers.update({name: given for name in numbers if (given := getattr(self, name)) is not None})
-        if own["tried"] == 0:
-            bounds["min_hold_probability"] = 0.0
+            own["min_hold_probability"] = least or _DRAWN_HOLD
+        own |= {name: given for name in own if (given := getattr(self, name)) is not None}
         search = self.search.model_copy(update={"matching_rounds": own.pop("matching_rounds")})
-        return Effort(hold=self.hold, search=search, bounds=self.bounds.changed(**bounds), **own)
+        least = own.pop("min_hold_probability")
+        bounds = self.bounds.changed(min_hold_probability=least if own["tried"] else 0.0)
+        return Effort(hold=self.hold, search=search, bounds=bounds, **own)
 
     def weights(self) -> dict[str, float]:
         """Arguments of :func:`hand_surface`."""

@@ -135,16 +135,15 @@ def test_hands_that_hold_less_often_are_drawn_and_tried_more_often_unless_told()
     rounds = [effort.search.matching_rounds for effort in (opened, few, many)]
     assert rounds[0] == rounds[1] == PlanParams().search.matching_rounds > rounds[2]
     assert opened.bounds == few.bounds == PlanParams().bounds
-    assert many.bounds.squeeze_force < few.bounds.squeeze_force
     assert many.bounds.min_hold_probability > 0
     numbers = {"draws": 6, "finalists": 2, "tried": 0}
-    told = PlanParams(**numbers, matching_rounds=7, hold=HoldTest(draws=5), squeeze_force=30, min_hold_probability=0.0)
+    told = PlanParams(**numbers, matching_rounds=7, hold=HoldTest(draws=5), min_hold_probability=0.0)
     for effort in (told.effort(fingers) for fingers in (3, 4, None)):
         assert effort._asdict().items() >= numbers.items()
         assert effort.hold.draws == 5
         assert effort.search.matching_rounds == 7
-        assert (effort.bounds.squeeze_force, effort.bounds.min_hold_probability) == (30, 0)
-    told = PlanParams(bounds=PlanParams().bounds.changed(squeeze_force=50, min_hold_probability=0.5))
+        assert effort.bounds.min_hold_probability == 0
+    told = PlanParams(bounds=PlanParams().bounds.changed(min_hold_probability=0.5))
     assert told.effort(4).bounds == told.bounds
 
 

@@ -88,7 +88,6 @@ class _Bench:
     ) -> None:
         self.networks, self.source, self.hand, self.palmar, self.starts = networks, source, hand, palmar, starts
         self.params = cloud_params(PlanParams())
-        self.bounds = self.params.effort(hand.model.groups).bounds
 
     def plans(self, model: ObjectModel, kind: str, rng: np.random.Generator, number: int) -> GraspTable:
         """Plans from a new cloud of a mesh as rows of it: checked there, with the control poses that were planned."""
@@ -97,7 +96,7 @@ class _Bench:
         planner = predicted_planner(self.networks, self.hand, cloud, self.starts, self.params, self.palmar, seed=number)
         planned, _ = planner.run(self.starts)
         pose = internal_poses(user_poses(planned.pose, cloud.center), np.zeros(3))
-        obj, bounds = upload_object(model, self.hand.device), self.bounds
+        obj, bounds = upload_object(model, self.hand.device), self.params.bounds
         contacts = find_contacts(self.hand, obj, pose, planned.q, bounds, self.palmar)
         table, outcome = check_grasps(self.hand, obj, pose, planned.q, contacts, bounds)
         table.metrics["valid"] = (outcome == Outcome.KEPT).astype(np.float32)
@@ -107,7 +106,7 @@ class _Bench:
     def write(self, folder: Path, model: ObjectModel, table: GraspTable) -> None:
         """Rows of one mesh as a shard."""
         hand = self.hand.model
-        config = {"bounds": self.bounds.describe(), **hand_config(self.source)}
+        config = {"bounds": self.params.bounds.describe(), **hand_config(self.source)}
         header = ShardHeader(pipeline="plan", seed=0, shard_index=0, config=config)
         record = hand_record(hand, mesh_blobs(self.source.urdf))
         rows = grasp_rows(press(table), hand.tree, model.center)
