@@ -24,6 +24,7 @@ class Outcome(IntEnum):
     APPROACH = 8
     SQUEEZE = 9
     TOUCH = 10
+    HOLD = 11
 
 
 KEPT = wp.constant(int(Outcome.KEPT))
@@ -46,10 +47,13 @@ REASONS = (
 
 SHARED = (*REASONS, "touch")
 
+NOT_HELD = "not held"
+"""Outcome HOLD in words, of plans alone."""
+
 FAILED_BOUNDS = (
     *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
     *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel", "min_stable_squeeze"),
-    *("max_closing_travel", "min_epsilon", "min_pregrasp_opening"),
+    *("max_closing_travel", "min_epsilon", "min_pregrasp_opening", "min_hold_probability"),
 )
 """By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
 way of the open hand to the object clears the table."""
@@ -61,6 +65,7 @@ _FAILED = {
     Outcome.UNRESISTED_LOAD: "max_unresisted_load",
     Outcome.TABLE: "min_table_distance",
     Outcome.APPROACH: "approach",
+    Outcome.HOLD: "min_hold_probability",
 }
 
 MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")

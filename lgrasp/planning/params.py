@@ -1,6 +1,6 @@
 """Parameters of plans."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import Field
 
@@ -13,6 +13,7 @@ _CLOUD_GAP = 6.0e-3  # [m]
 _FEW_FINGERS = 3
 _DRAWN_ROUNDS = 16  # 20 give no more plans that hold, 12 a few fewer
 _PLAN_BOUNDS = GraspBounds(profile="plan")
+_DRAWN_HOLD = 0.75  # six of eight draws
 
 
 class Effort(NamedTuple):
@@ -21,8 +22,9 @@ class Effort(NamedTuple):
     draws: int
     finalists: int
     tried: int
-    matching_rounds: int
     hold: HoldTest
+    search: LocalSearch
+    bounds: GraspBounds
 
 
 class PlanParams(Params):
@@ -35,7 +37,7 @@ class PlanParams(Params):
         default=None,
         ge=1,
         le=64,
-        description="Hands that a network draws for each start; default: 8, or 40 where a hand has three fingers or "
+        description="Hands that a network draws for each start; default: 24, or 40 where a hand has three fingers or "
         "fewer, which hold less often.",
     )
     thicker: float = Field(
@@ -54,15 +56,15 @@ class PlanParams(Params):
         default=None,
         ge=1,
         le=64,
-        description="Hands of each start that continue after the first matchings; default: 5 of 8 and 24 of 40 that a "
-        "network draws, else 10.",
+        description="Hands of each start that continue after the first matchings; default: 12 of 24 and 24 of 40 that "
+        "a network draws, else 10.",
     )
     opening: int = Field(default=5, ge=1, le=100, description="Matchings of all of them.")
     matching_rounds: int | None = Field(
         default=None,
         ge=1,
         le=1000,
-        description="Matchings of those that continue; default: 16 of 8 that a network draws, else those of `search`.",
+        description="Matchings of those that continue; default: 16 of 24 that a network draws, else those of `search`.",
     )
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
@@ -93,23 +95,33 @@ class PlanParams(Params):
         ge=0,
         le=64,
         description="Hands of each start that are tried at most, those that resist most first, until one always holds: "
-        "the one that holds most often is the plan. 0: none; default: 3 of 8 that a network draws, 8 of 40, else 10.",
+        "the one that holds most often is the plan. 0: none; default: 8 of those that a network draws, else 10.",
     )
-    hold: HoldTest | None = Field(
-        default=None, description="How they are tried; default: once those of 8 drawn by a network, others with draws."
+    hold: HoldTest = Field(default=HoldTest(), description="How they are tried.")
+    min_hold_probability: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Least share of the draws in which a hand that is tried must hold to be a plan, above 0 also in "
+        "the trial without; default: that of `bounds` if it has one, else 0.75 for 24 that a network draws.",
     )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
     def effort(self, fingers: int | None) -> Effort:
         """For hands with so many fingers that a network draws, or open ones (None)."""
-        rounds = self.search.matching_rounds
-        if fingers is None:
-            own = Effort(1, 10, 10, rounds, HoldTest())
-        elif fingers <= _FEW_FINGERS:
-            own = Effort(40, 24, 8, rounds, HoldTest())
-        else:
-            own = Effort(8, 5, 3, _DRAWN_ROUNDS, HoldTest(draws=0))
-        return Effort(*(x if (given := getattr(self, name)) is None else given for name, x in own._asdict().items()))
+        own: dict[str, Any] = {"draws": 1, "finalists": 10, "tried": 10}
+        own["matching_rounds"] = self.search.matching_rounds
+        own["min_hold_probability"] = least = self.bounds.min_hold_probability
+        if fingers is not None and fingers <= _FEW_FINGERS:
+            own |= {"draws": 40, "finalists": 24, "tried": 8}
+        elif fingers is not None:
+            own |= {"draws": 24, "finalists": 12, "tried": 8, "matching_rounds": _DRAWN_ROUNDS}
+            own["min_hold_probability"] = least or _DRAWN_HOLD
+        own |= {name: given for name in own if (given := getattr(self, name)) is not None}
+        search = self.search.model_copy(update={"matching_rounds": own.pop("matching_rounds")})
+        least = own.pop("min_hold_probability")
+        bounds = self.bounds.changed(min_hold_probability=least if own["tried"] else 0.0)
+        return Effort(hold=self.hold, search=search, bounds=bounds, **own)
 
     def weights(self) -> dict[str, float]:
         """Arguments of :func:`hand_surface`."""

@@ -13,13 +13,13 @@ from lgrasp.errors import ObjectError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import Compared, ContactTable, check_grasps, compare_grasps
 from lgrasp.grasp.find_contacts import find_contacts
-from lgrasp.grasp.outcomes import REASONS, Outcome, bounds_squeeze, failed_bounds
+from lgrasp.grasp.outcomes import NOT_HELD, REASONS, Outcome, bounds_squeeze, failed_bounds
 from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps, take_rows
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.palm import palm_axis
 from lgrasp.hold.params import HoldTest
-from lgrasp.hold.run import ControlPoses, HoldTester
+from lgrasp.hold.run import METRICS, ControlPoses, HoldTester
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.kernels import invert_poses
@@ -99,7 +99,7 @@ class Planner:
             points = farthest_points(self.model.contact_points.astype(float), count)
         each = self.params.rolls if self.guesses is None else self._effort.draws
         size, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_HANDS // each, 1)
-        counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS], 0)
+        counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS, NOT_HELD], 0)
         tables = []
         search = self._scene.search
 
@@ -113,10 +113,11 @@ class Planner:
                 counts["colliding"] += tried - len(outcome)
                 for code, name in enumerate(REASONS):
                     counts[name] += int((outcome == code).sum())
+                counts[NOT_HELD] += int((outcome == Outcome.HOLD).sum())
                 passed = outcome == Outcome.KEPT
                 table.metrics["valid"] = passed.astype(np.float32)
                 if keep_invalid:
-                    table.metrics["failed_bound"] = failed_bounds(table, outcome, self.params.bounds)
+                    table.metrics["failed_bound"] = failed_bounds(table, outcome, self._effort.bounds)
                 tables.append(take_grasps(table, np.flatnonzero(passed | keep_invalid)))
                 if progress:
                     progress(counts["starts"], counts["kept"])
@@ -131,19 +132,19 @@ class Planner:
         device, surface = self.hand.device, hand_surface(self.hand.model, self.palmar, **self.params.weights())
         around = None if self.around is None else upload_object(self.around, device)
         target = upload_target(self.model, self.around, device)
-        obj, search = upload_object(self.model, device), Descent(self.hand, target, self.params.search, surface)
+        obj, search = upload_object(self.model, device), Descent(self.hand, target, self._effort.search, surface)
         return _Scene(search, obj, around, _tester(self.hand, obj, self._effort.hold))
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
-        p, rounds = self.params, self._effort.matching_rounds
+        p, bounds, rounds = self.params, self._effort.bounds, self._effort.search.matching_rounds
         start, at = self._opened(search, points, first) if self.guesses is None else self._guessed(points)
         if len(start):
             search.run(at, rounds=min(p.opening, rounds), whole=rounds)
             start, at = self._finalists(start, at)
             search.run(at, first=p.opening, rounds=rounds, whole=rounds)
             return self._steadiest(start, at)
-        return check_grasps(*self._posed(at, p.bounds), p.bounds, index=start)
+        return check_grasps(*self._posed(at, bounds), bounds, index=start)
 
     def _opened(self, search: Descent, points: np.ndarray, first: int) -> tuple[np.ndarray, Hands]:
         """Starts, and open hands that advanced to the surface."""
@@ -168,15 +169,15 @@ class Planner:
         """The best hands of each start after the first matchings."""
         if np.bincount(start).max() <= self._effort.finalists:
             return start, at
-        found = self._compared(at, _loosened(self.params.bounds))
+        found = self._compared(at, _loosened(self._effort.bounds))
         place = _places(start, found.unresisted_load + found.penetration / _WHOLE_LOAD)
         rows = np.flatnonzero(place < self._effort.finalists)
         return start[rows], at.taken(rows)
 
     def _steadiest(self, start: np.ndarray, at: Hands) -> tuple[GraspTable, np.ndarray]:
         """One hand of each start, and its outcome: of those tried the one that holds most often, then the one that
-        resists most."""
-        bounds, tried = self.params.bounds, self._effort.tried
+        resists most; it is no plan if it holds too rarely."""
+        bounds, tried = self._effort.bounds, self._effort.tried
         found = self._compared(at, bounds)
         passed = found.outcome == Outcome.KEPT
         place = _places(start, 2 * ~passed + found.unresisted_load)
@@ -186,8 +187,13 @@ class Planner:
         table, outcome = check_grasps(
             *self._posed(at.taken(rows), bounds), bounds, around=self._scene.around, index=start
         )
-        held = self._held(table, np.where(passed, place, tried))
-        order = np.lexsort([place, -held, outcome != Outcome.KEPT, start])
+        held, draws = self._held(table, np.where(passed, place, tried)), self._effort.hold.draws
+        often = np.zeros(len(place))
+        if held is not None:
+            loose = ~bounds.held_by(held) if bounds.min_hold_probability > 0 else False
+            outcome = np.where((outcome == Outcome.KEPT) & loose, Outcome.HOLD, outcome)
+            often = held["hold_success"] + draws * held["hold_probability"]
+        order = np.lexsort([place, -often, outcome != Outcome.KEPT, start])
         best = np.sort(order[np.flatnonzero(np.diff(start[order], prepend=-1))])
         return take_rows(table, best), outcome[best]
 
@@ -195,19 +201,26 @@ class Planner:
         bounds = bounds.changed(friction=self.params.rank_friction)
         return compare_grasps(*self._posed(at, bounds), bounds, around=self._scene.around)
 
-    def _held(self, table: GraspTable, place: np.ndarray) -> np.ndarray:
-        """Share of the trials in which each hand holds, (M,): of each start those at the first places are tried, until
-        one always holds; twice as many at once each time, since few trials keep a GPU as long as many."""
-        held, tester, first = np.zeros(len(place)), self._scene.tester, 0
-        tried, draws = self._effort.tried, self._effort.hold.draws
-        while tester is not None and first < tried:
+    def _held(self, table: GraspTable, place: np.ndarray) -> dict[str, np.ndarray] | None:
+        """Metrics of the hold test of each hand, (M,), 0 untried; None: none is tried.
+
+        Of each start those at the first places are, until one always holds; twice as many at once each time, since few
+        trials keep a GPU as long as many.
+        """
+        tester, tried, first = self._scene.tester, self._effort.tried, 0
+        if tester is None or tried == 0:
+            return None
+        held = {name: np.zeros(len(place), np.float32) for name in METRICS}
+        while first < tried:
             last = min(2 * first + 1, tried)
-            done = np.isin(table.index, table.index[held == 1])
+            always = (held["hold_success"] > 0) & (held["hold_probability"] == 1)
+            done = np.isin(table.index, table.index[always])
             rows = np.flatnonzero((place >= first) & (place < last) & ~done)
             if not len(rows):
                 break
-            found = tester.run(ControlPoses.of(take_grasps(table, rows)), 0)
-            held[rows] = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
+            poses, least = ControlPoses.of(take_grasps(table, rows)), self._effort.bounds.min_hold_probability
+            for name, values in tester.run(poses, 0, least=least).items():
+                held[name][rows] = values
             first = last
         return held
 

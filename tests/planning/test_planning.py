@@ -8,7 +8,7 @@ import pytest
 
 from lgrasp.cloud.model import cloud_object
 from lgrasp.grasp.check import check_grasps, compare_grasps, known_contacts
-from lgrasp.grasp.outcomes import REASONS, Outcome
+from lgrasp.grasp.outcomes import FAILED_BOUNDS, NOT_HELD, REASONS, Outcome
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import ControlPoses, HoldTester
@@ -33,7 +33,7 @@ def planned(planner):
 
 def test_every_start_is_accounted_for(planned):
     counts = planned.counts
-    assert counts["starts"] == 8 == counts["colliding"] + sum(counts[name] for name in REASONS)
+    assert counts["starts"] == 8 == counts["colliding"] + sum(counts[name] for name in (*REASONS, NOT_HELD))
     assert counts["kept"] == len(planned.grasps) == len(set(planned.grasps.index)) > 0
 
 
@@ -131,9 +131,38 @@ def test_parameters_are_bounded():
 def test_hands_that_hold_less_often_are_drawn_and_tried_more_often_unless_told():
     few, many, opened = (PlanParams().effort(fingers) for fingers in (3, 4, None))
     assert few.draws > many.draws
-    assert few.tried > many.tried
-    assert few.hold.draws > many.hold.draws
     assert opened.finalists == 10
-    assert opened.matching_rounds == few.matching_rounds == PlanParams().search.matching_rounds > many.matching_rounds
-    told = PlanParams(draws=6, finalists=2, tried=0, matching_rounds=7, hold=HoldTest(draws=5))
-    assert all(told.effort(fingers) == (6, 2, 0, 7, told.hold) for fingers in (3, 4, None))
+    rounds = [effort.search.matching_rounds for effort in (opened, few, many)]
+    assert rounds[0] == rounds[1] == PlanParams().search.matching_rounds > rounds[2]
+    assert opened.bounds == few.bounds == PlanParams().bounds
+    assert many.bounds.min_hold_probability > 0
+    numbers = {"draws": 6, "finalists": 2, "tried": 0}
+    told = PlanParams(**numbers, matching_rounds=7, hold=HoldTest(draws=5), min_hold_probability=0.0)
+    for effort in (told.effort(fingers) for fingers in (3, 4, None)):
+        assert effort._asdict().items() >= numbers.items()
+        assert effort.hold.draws == 5
+        assert effort.search.matching_rounds == 7
+        assert effort.bounds.min_hold_probability == 0
+    told = PlanParams(bounds=PlanParams().bounds.changed(min_hold_probability=0.5))
+    assert told.effort(4).bounds == told.bounds
+
+
+def test_hands_that_do_not_hold_as_often_as_is_asked_are_no_plans(inputs):
+    """Of each start the best stays a plan if it holds so often, else it is counted; none may be another."""
+    params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": 12, "hold": HoldTest(draws=4)})
+    strict = params.model_copy(update={"min_hold_probability": 0.75})
+    free = Planner(inputs.hand, inputs.object.model, 0.12, params).run(60)
+    planner = Planner(inputs.hand, inputs.object.model, 0.12, strict)
+    asked = planner.run(60)
+    assert 0 < asked.counts[NOT_HELD] == free.counts["kept"] - asked.counts["kept"] < free.counts["kept"]
+    assert free.counts[NOT_HELD] == 0
+    found = HoldTester(inputs.hand, inputs.object, params.hold).run(ControlPoses.of(asked.grasps), 0)
+    assert found["hold_success"].all()
+    assert (found["hold_probability"] >= 0.75).all()
+    every = planner.run(60, keep_invalid=True).grasps
+    lost = every.metrics["failed_bound"] == FAILED_BOUNDS.index("min_hold_probability")
+    assert lost.sum() == asked.counts[NOT_HELD]
+    assert not every.metrics["valid"][lost].any()
+    untried = strict.model_copy(update={"tried": 0})
+    counts = Planner(inputs.hand, inputs.object.model, 0.12, untried).run(60).counts
+    assert counts["kept"] == free.counts["kept"]  # who tries nothing refuses nothing
