@@ -120,6 +120,13 @@ class GraspBounds(Params):
         description="Least force at which a squeeze of soft joints would push the object out sideways [N]; 0 asks for "
         "nothing.",
     )
+    min_stable_pinch: float = Field(
+        default=0.0,
+        ge=0,
+        le=1000,
+        description="The same for grasps of two contacts, about which an object turns easily [N]; min_stable_squeeze "
+        "counts where it is more.",
+    )
     squeeze_margin: float = Field(
         default=0.0,
         ge=0,

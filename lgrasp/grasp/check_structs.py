@@ -34,6 +34,7 @@ class Limits:
     squeeze_stiffness: wp.float32
     min_squeeze_travel: wp.float32
     min_stable_squeeze: wp.float32
+    min_stable_pinch: wp.float32
     max_closing_travel: wp.float32
     min_pregrasp_opening: wp.float32
     squeeze_margin: wp.float32

@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
-from lgrasp.grasp.outcomes import KEPT, SQUEEZE
+from lgrasp.grasp.outcomes import KEPT, PINCH, SQUEEZE
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.cholesky import solving
 from lgrasp.math.constants import SLIDING_ARM
@@ -254,9 +254,9 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
 
 @wp.kernel
 def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)):
-    """Rows that squeeze the object by less than ``min_squeeze_travel``, or cannot stably with ``min_stable_squeeze``,
-    or close by more than ``max_closing_travel``, or have less than ``min_epsilon``, or a finger that opens by less than
-    ``min_pregrasp_opening``, become none.
+    """Rows that squeeze the object by less than ``min_squeeze_travel``, or cannot stably with ``min_stable_squeeze``
+    (of two contacts: ``min_stable_pinch``), or close by more than ``max_closing_travel``, or have less than
+    ``min_epsilon``, or a finger that opens by less than ``min_pregrasp_opening``, become none.
 
     Args:
         row_out: (m,) hand of each row, -1 none.
@@ -265,7 +265,13 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     i = wp.tid()
     if row_out[i] < 0:
         return
-    limp = packed.squeeze_travel[i] < limits.min_squeeze_travel or packed.stable_squeeze[i] < limits.min_stable_squeeze
+    contacts = int(0)
+    for c in range(packed.contact_links.shape[1]):
+        contacts += wp.where(packed.contact_links[i, c] >= 0, 1, 0)
+    stable = limits.min_stable_squeeze
+    if contacts == PINCH:
+        stable = wp.max(stable, limits.min_stable_pinch)
+    limp = packed.squeeze_travel[i] < limits.min_squeeze_travel or packed.stable_squeeze[i] < stable
     still = packed.pregrasp_opening[i] < limits.min_pregrasp_opening
     far = packed.closing_travel[i] > limits.max_closing_travel
     if limp or still or far or packed.epsilon[i] < limits.min_epsilon:

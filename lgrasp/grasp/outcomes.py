@@ -27,6 +27,9 @@ class Outcome(IntEnum):
     HOLD = 11
 
 
+PINCH = wp.constant(2)
+"""Contacts of a grasp that bounds.min_stable_pinch is for."""
+
 KEPT = wp.constant(int(Outcome.KEPT))
 UNUSED_FINGER = wp.constant(int(Outcome.UNUSED_FINGER))
 SELF_COLLISION = wp.constant(int(Outcome.SELF_COLLISION))
@@ -86,7 +89,8 @@ _SQUEEZE_BOUNDS = (
 
 def bounds_squeeze(bounds: Any) -> bool:
     """Whether one of _SQUEEZE_BOUNDS asks for something; ``bounds`` as of :func:`failed_squeeze`."""
-    least = bounds.min_squeeze_travel, bounds.min_stable_squeeze, bounds.min_epsilon, bounds.min_pregrasp_opening
+    least = [bounds.min_squeeze_travel, bounds.min_epsilon, bounds.min_pregrasp_opening]
+    least += [bounds.min_stable_squeeze, bounds.min_stable_pinch]
     return max(least) > 0 or bounds.max_closing_travel < ANY_CLOSING
 
 
@@ -96,10 +100,12 @@ def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
     Args:
         bounds: GraspBounds, or the same numbers on a device.
     """
+    pinch = (table.contact_links >= 0).sum(1) == int(PINCH)
     return [
         table.metrics["squeeze_travel"] < bounds.min_squeeze_travel,
         table.metrics["closing_travel"] > bounds.max_closing_travel,
-        table.metrics["stable_squeeze"] < bounds.min_stable_squeeze,
+        (table.metrics["stable_squeeze"] < bounds.min_stable_squeeze)
+        | (pinch & (table.metrics["stable_squeeze"] < bounds.min_stable_pinch)),
         table.metrics["epsilon"] < bounds.min_epsilon,
         table.metrics["pregrasp_opening"] < bounds.min_pregrasp_opening,
     ]

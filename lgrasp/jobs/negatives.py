@@ -28,6 +28,7 @@ _LOOSE: dict[str, float] = {
     "min_epsilon": 0.0,
     "min_squeeze_travel": 0.0,
     "min_stable_squeeze": 0.0,
+    "min_stable_pinch": 0.0,
     "max_closing_travel": ANY_CLOSING,
     "min_pregrasp_opening": 0.0,
     "min_table_distance": 0.0,

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.wrench import residual
 
+from lgrasp.engine.batch import run_stages
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.outcomes import REASONS
 from lgrasp.grasp.stability_kernels import CONTACT_STIFFNESS, MOST_SQUEEZE
@@ -201,6 +202,19 @@ def test_grasps_that_hardly_squeeze_are_dropped_where_asked(tables, context, swi
     assert bound[1]["squeeze"] == (~kept).sum() > 10
     assert bound[1]["kept"] == len(bound[0]) == kept.sum()
     np.testing.assert_array_equal(free[0].q[kept], bound[0].q)
+
+
+def test_pinches_must_squeeze_more_stably_where_asked(context, swift):
+    pairs, bounds = swift.with_params("search", contacts=(2,)), context.bounds
+    sets = run_stages(pairs, context, 0, 500, "search")
+    free = run(sets, swift.params("filter"), context)[0]
+    pinch, stable = (free.contact_links >= 0).sum(1) == 2, free.metrics["stable_squeeze"]
+    least = float(np.median(stable[pinch]))
+    asked = replace(context, bounds=bounds.changed(min_stable_pinch=least))
+    bound = run(sets, swift.params("filter"), asked)[0]
+    kept = ~pinch | (stable >= np.float32(least))
+    assert 5 < (~kept).sum() < pinch.sum()
+    np.testing.assert_array_equal(free.q[kept], bound.q)
 
 
 def test_grasps_that_close_from_far_away_are_dropped_where_asked(tables, context, swift):
