@@ -14,14 +14,17 @@ from lgrasp.signals import stop_signals
 
 _PATIENCE = 5.0  # [s] that a job may take to leave what it is making
 _GRACE = 1.0  # [s] that tidying up may take
-
-
 _ONE = 0.2  # [s] within which two signals are one: some programs send them to a process and then to its group
+
+_errors = 2  # standard error
 
 
 def heed_signals() -> None:
     """End this process when it is asked to stop: between two steps of the main thread; or, if that is in native code or
     a job takes its time, when it is asked again or after five seconds."""
+    global _errors
+    with suppress(OSError):  # closed
+        _errors = os.dup(2)  # what native code writes to 2 may be caught for a while
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
@@ -65,7 +68,7 @@ def _leave(seconds: float) -> None:
 def tell(line: str) -> None:
     """Print a line on standard error from a signal handler, which may have interrupted another one."""
     with suppress(OSError):
-        os.write(2, f"{line}\n".encode())
+        os.write(_errors, f"{line}\n".encode())
 
 
 @contextmanager

@@ -13,6 +13,10 @@ from lgrasp.engine.registry import OPTIONAL, ORDERS, STAGES
 PAGE = ROOT / "docs" / "guides" / "pipeline.md"
 
 
+CHOSEN = ("ik", "wrap", "adjust")
+"""Stages that some pipelines lack."""
+
+
 def folders(path: Path) -> set[str]:
     return {p.name for p in path.iterdir() if p.is_dir() and not p.name.startswith(("_", "."))}
 
@@ -21,7 +25,7 @@ def test_folders():
     packages = {stage.package for stage in STAGES.values()}
     assert packages == {f"lgrasp.stages.{name}" for name in folders(ROOT / "lgrasp" / "stages")}
     assert folders(ROOT / "tests" / "stages") == folders(ROOT / "lgrasp" / "stages")
-    assert all({*order, *OPTIONAL, "wrap"} == set(STAGES) for order in ORDERS)
+    assert all({*order, *OPTIONAL, *CHOSEN} == set(STAGES) for order in ORDERS)
     for name, stage in STAGES.items():
         assert stage.name == name
         assert stage.run.__module__ == f"{stage.package}.stage"
@@ -31,7 +35,7 @@ def test_folders():
 @pytest.mark.parametrize("name", sorted(pipeline_files()))
 def test_pipelines(name):
     declared = yaml.safe_load(pipeline_files()[name].read_text())
-    assert {stage for entry in declared["stages"] for stage in entry} | {*OPTIONAL, "wrap"} == set(STAGES)
+    assert {stage for entry in declared["stages"] for stage in entry} | {*OPTIONAL, *CHOSEN} == set(STAGES)
 
 
 def test_commands():

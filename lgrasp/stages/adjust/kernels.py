@@ -25,7 +25,7 @@ from lgrasp.stages.adjust.motion import (
     turn_row,
     vec6,
 )
-from lgrasp.stages.adjust.structs import AdjustCount, Adjusted, AdjustValues, Progress, Touch
+from lgrasp.stages.adjust.structs import AdjustCount, Adjusted, AdjustValues, FaceContact, Progress
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -39,14 +39,14 @@ _FIRST_BOTH = wp.constant(2)  # and both ways, where contacts are not made earli
 @wp.func
 def _touch_at(hand: Hand, k: wp.int32):
     """A contact before it slides: contact point k of the hand."""
-    touch = Touch()
+    touch = FaceContact()
     touch.local = hand.contacts.points[k]
     touch.out = hand.contacts.normals[k]
     return touch
 
 
 @wp.func
-def _slid(hand: Hand, grid: wp.int32, touch: Touch, target: wp.vec3):
+def _slid(hand: Hand, grid: wp.int32, touch: FaceContact, target: wp.vec3):
     """The contact after it slid to the point of the link nearest to ``target`` (body frame), as long as that lies on
     the same face."""
     e = sdf_gradient(hand_grid(hand.contacts, grid), target)
@@ -61,21 +61,21 @@ def _slid(hand: Hand, grid: wp.int32, touch: Touch, target: wp.vec3):
 
 
 @wp.func
-def _made(hand: Hand, params: AdjustValues, grid: wp.int32, touch: Touch, facing: wp.float32):
+def _made(hand: Hand, params: AdjustValues, grid: wp.int32, touch: FaceContact, facing: wp.float32):
     """True if a contact is made; ``facing`` is the cosine of its normals."""
     there = touch.beside == 0 and wp.abs(touch.gap + params.contact_indentation) <= params.gap
     return there and facing >= params.cosine and contact_allowed(hand.contacts, grid, touch.out)
 
 
 @wp.func
-def _is_near(params: AdjustValues, touch: Touch, facing: wp.float32):
+def _is_near(params: AdjustValues, touch: FaceContact, facing: wp.float32):
     """True if a contact may yet be made."""
     off = wp.abs(touch.gap + params.contact_indentation)
     return touch.beside == 0 and off <= _NEAR and facing >= _NEAR_COSINE
 
 
 @wp.func
-def _looseness(params: AdjustValues, touch: Touch):
+def _looseness(params: AdjustValues, touch: FaceContact):
     """Weight of the offset along the face: a contact slides on its face, and comes back from beside it."""
     return wp.where(touch.beside == 1, 1.0, params.slide_weight)
 
@@ -84,7 +84,7 @@ def _looseness(params: AdjustValues, touch: Touch):
 def _add_object_rows(
     equations: wp.array(dtype=vec6),
     params: AdjustValues,
-    touch: Touch,
+    touch: FaceContact,
     p: wp.vec3,
     n: wp.vec3,
     target: wp.vec3,

@@ -12,7 +12,7 @@ from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.adjust.depth import find_depths
 from lgrasp.stages.adjust.kernels import FIRST_DEPTH, begin_sets, check_thumbs, step_sets, take_whole
 from lgrasp.stages.adjust.params import AdjustParams
-from lgrasp.stages.adjust.structs import AdjustCount, Adjusted, AdjustValues, Deepest, Touch
+from lgrasp.stages.adjust.structs import AdjustCount, Adjusted, AdjustValues, Deepest, FaceContact
 from lgrasp.stages.context import Context
 
 VERSION = 1
@@ -38,7 +38,7 @@ def run(inputs: ContactSets, params: AdjustParams, context: Context) -> tuple[Co
     values = make_struct(AdjustValues, params, context.bounds, **angles)
     hand, obj, field = context.hand.struct, context.object.struct, context.field.struct
     parts, bodies = depth_slices(d), len(context.hand.model.piece_first) - 1
-    given = {"touch": wp.empty((n, groups + 1), dtype=Touch, device=d)}
+    given = {"touch": wp.empty((n, groups + 1), dtype=FaceContact, device=d)}
     given["deepest"] = wp.empty((n, bodies, parts), dtype=Deepest, device=d)
     moving = empty_struct(Adjusted, d, n, **given)
     wp.launch(begin_sets, n, [field, hand, inputs.struct, inputs.candidates.struct], [table.struct, moving], device=d)

@@ -52,7 +52,7 @@ class Deepest:
 
 
 @wp.struct
-class Touch:
+class FaceContact:
     """A contact of a finger: where it is, and how far from being made."""
 
     local: wp.vec3  # [m] point of the link, body frame
@@ -67,5 +67,5 @@ class Adjusted:
 
     progress: wp.array(dtype=wp.int32)  # (S,) Progress
     both: wp.array(dtype=wp.int32)  # (S,) 1: penetration is looked at both ways
-    touch: wp.array2d(dtype=Touch)  # (S, G + 1) contact of each group, the palm's last
+    touch: wp.array2d(dtype=FaceContact)  # (S, G + 1) contact of each group, the palm's last
     deepest: wp.array3d(dtype=Deepest)  # (S, B, K) of bodies whose fingers touch, and of the base
