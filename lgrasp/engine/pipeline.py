@@ -70,6 +70,11 @@ class Pipeline(_Head):
         return "ik" in self.order and self.order.index("ik") < self.order.index("search")
 
     @property
+    def open_to_hands(self) -> bool:
+        """True if it has both ik and adjust: a hand decides which of them it runs."""
+        return {"ik", "adjust"} <= {*self.order}
+
+    @property
     def on_table(self) -> bool:
         """True if grasps leave room for the table that the object rests on, or for a plane that is asked for."""
         return self.params("place").table or self.steer.above is not None
@@ -100,12 +105,12 @@ class Pipeline(_Head):
         return self.model_copy(update={"stages": stages})
 
     def suited(self, joints: float) -> "Pipeline":
-        """A copy with one of stages ik and adjust where the pipeline has both.
+        """A copy with one of stages ik and adjust where it is open to hands.
 
         Args:
             joints: of its own that a finger of the hand has on the mean.
         """
-        if not {"ik", "adjust"} <= {*self.order}:
+        if not self.open_to_hands:
             return self
         adjusts = joints <= self.params("adjust").joints and not self.poses_stay
         return self.without("ik" if adjusts else "adjust")

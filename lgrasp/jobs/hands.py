@@ -66,7 +66,7 @@ def own_policy(pipeline: Pipeline, hand: str) -> Path | None:
 
 
 def _suited(pipeline: Pipeline, hand: str) -> Pipeline:
-    if not {"ik", "adjust"} <= {*pipeline.order}:
+    if not pipeline.open_to_hands:
         return pipeline
     source = hand_source(hand)
     return pipeline.suited(float(build_tree(read_urdf(source.urdf), source.spec).dof_free.mean()))

@@ -62,7 +62,7 @@ def run_up_to(
         raise ConfigError(f"--first {first} --candidates {count} --shard-index {shard}: need 0, 1 and 0 or more")
     if last not in pipeline.order:
         raise ConfigError(f"pipeline {pipeline.name} has no stage {last}; its stages: {', '.join(pipeline.order)}")
-    if {"ik", "adjust"} <= {*pipeline.order} and last in ("ik", "adjust"):
+    if pipeline.open_to_hands and last in ("ik", "adjust"):
         pipeline = pipeline.without("adjust" if last == "ik" else "ik")
     pipeline, used = for_hand(pipeline, hand), resolve_device(device)
     keys = input_keys(hand_source(hand), mesh, scale, pipeline.object, pipeline.field, pipeline.hand)

@@ -81,6 +81,13 @@ def _looseness(params: AdjustValues, touch: FaceContact):
 
 
 @wp.func
+def _turn_weight(params: AdjustValues):
+    """Weight of the squared angle of two normals [m^2]."""
+    w = params.normal_weight * params.lever
+    return w * w
+
+
+@wp.func
 def _add_object_rows(
     equations: wp.array(dtype=vec6),
     params: AdjustValues,
@@ -92,12 +99,11 @@ def _add_object_rows(
     normal: wp.vec3,
 ):
     """What a contact at p with normal n asks of the object's motion about ``centre``, base frame."""
-    w = params.normal_weight * params.lever
     aim = p - n * params.contact_indentation - target
     arm = target - centre
     add_distance(equations, motion_row(n, arm), wp.dot(n, aim), 1.0)
     add_offset(equations, arm, aim, _looseness(params, touch))
-    add_turn(equations, normal, normal - n, w * w)
+    add_turn(equations, normal, normal - n, _turn_weight(params))
 
 
 @wp.kernel
@@ -196,8 +202,7 @@ def _stepping(size: int) -> Any:
         groups = moved_out.count.shape[1]
         T = moved_out.poses.pose[i]
         palm = moved_out.poses.palm_point[i]
-        w2 = params.normal_weight * params.lever
-        w2 = w2 * w2
+        w2 = _turn_weight(params)
         X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
         V = wp.zeros(shape=(size,), dtype=wp.vec3)
         R = wp.zeros(shape=(size,), dtype=wp.vec3)
