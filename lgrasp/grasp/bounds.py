@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 ANY_CLOSING = 10.0
 """[rad or m]; joints never close by so much."""
+ANY_PENETRATION = 0.03
+"""[m]; closing fingers never penetrate more, as it is measured."""
 
 PROFILES: dict[str, dict[str, float]] = {
     "strict": {},
@@ -87,6 +89,13 @@ class GraspBounds(Params):
         ge=0,
         le=ANY_CLOSING,
         description="Farthest that a joint moves from q_pregrasp to q [rad or m]; 10 asks for nothing.",
+    )
+    max_closing_penetration: float = Field(
+        default=ANY_PENETRATION,
+        ge=0,
+        le=ANY_PENETRATION,
+        description="Largest penetration of fingers and object two thirds of the way from q_pregrasp to q [m]; "
+        "0.03 asks for nothing.",
     )
     min_pregrasp_opening: float = Field(
         default=0.0,

@@ -28,6 +28,7 @@ from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome, b
 from lgrasp.grasp.pregrasp_kernels import (
     FINGER_TRIES,
     OPENING_SHARES,
+    measure_closing,
     open_fingers,
     open_poses,
     try_fingers,
@@ -171,8 +172,9 @@ class Check:
         at, found = self.at, self.found
         postures = {n: wp.empty((m, model.dofs), dtype=wp.float32, device=d) for n in ("q", "q_pregrasp", "q_squeeze")}
         numbers = wp.empty((len(MEASURED), m), dtype=wp.float32, device=d)
+        grown = {"closing_penetration": wp.zeros(m, dtype=wp.float32, device=d)}
         none = {"resting": wp.empty(0, dtype=wp.int32, device=d), "approach": wp.empty(0, dtype=wp.vec3, device=d)}
-        packed = empty_struct(Packed, d, m, at.contact.shape[1], numbers=numbers, **postures, **none)
+        packed = empty_struct(Packed, d, m, at.contact.shape[1], numbers=numbers, **postures, **grown, **none)
         opened = wp.empty((m, model.groups, 2), dtype=vec_dof, device=d)
         wp.launch(center_forces, m, [limits, places, at, row], [found], device=d)
         inputs = [hand, limits, places, at, found, row]
@@ -189,6 +191,7 @@ class Check:
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)
         inputs = [hand, self.held.struct, limits, at, opened, row, stuck, clear]
         wp.launch(open_fingers, m, inputs, [packed], device=d)
+        wp.launch(measure_closing, (model.groups, m), [hand, obj, at, row], [packed], device=d)
         wp.launch(grasp_epsilon, m, [obj, seed, limits, places, at, row], [packed], device=d)
         wp.launch(pack_rows, m, [hand, places, at, found, row], [packed], device=d)
         return packed

@@ -36,6 +36,7 @@ class Limits:
     min_stable_squeeze: wp.float32
     min_stable_pinch: wp.float32
     max_closing_travel: wp.float32
+    max_closing_penetration: wp.float32
     min_pregrasp_opening: wp.float32
     squeeze_margin: wp.float32
     deepest: wp.float32  # penetrations above this are not distinguished
@@ -105,6 +106,7 @@ class Packed:
     squeeze_travel: wp.array(dtype=wp.float32)  # (m,) [m]
     stable_squeeze: wp.array(dtype=wp.float32)  # (m,) [N]
     closing_travel: wp.array(dtype=wp.float32)  # (m,) [rad or m]
+    closing_penetration: wp.array(dtype=wp.float32)  # (m,) [m]
     resting: wp.array(dtype=wp.int32)  # (m,) resting pose of the object; only where there is a table, as the next
     approach: wp.array(dtype=wp.vec3)  # (m,) direction in which the open hand comes, base frame; NaN none
 

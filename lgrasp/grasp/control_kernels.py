@@ -255,8 +255,9 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
 @wp.kernel
 def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)):
     """Rows that squeeze the object by less than ``min_squeeze_travel``, or cannot stably with ``min_stable_squeeze``
-    (of two contacts: ``min_stable_pinch``), or close by more than ``max_closing_travel``, or have less than
-    ``min_epsilon``, or a finger that opens by less than ``min_pregrasp_opening``, become none.
+    (of two contacts: ``min_stable_pinch``), or close by more than ``max_closing_travel``, or through more of the object
+    than ``max_closing_penetration``, or have less than ``min_epsilon``, or a finger that opens by less than
+    ``min_pregrasp_opening``, become none.
 
     Args:
         row_out: (m,) hand of each row, -1 none.
@@ -274,7 +275,8 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     limp = packed.squeeze_travel[i] < limits.min_squeeze_travel or packed.stable_squeeze[i] < stable
     still = packed.pregrasp_opening[i] < limits.min_pregrasp_opening
     far = packed.closing_travel[i] > limits.max_closing_travel
-    if limp or still or far or packed.epsilon[i] < limits.min_epsilon:
+    through = packed.closing_penetration[i] > limits.max_closing_penetration
+    if limp or still or far or through or packed.epsilon[i] < limits.min_epsilon:
         row_out[i] = -1
         wp.atomic_sub(counts_out, KEPT, 1)
         wp.atomic_add(counts_out, SQUEEZE, 1)

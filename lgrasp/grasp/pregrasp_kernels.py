@@ -1,10 +1,11 @@
-"""Kernels of the hand that is opened before the grasp: all fingers alike, or each by itself."""
+"""Kernels of the hand that is opened before the grasp, all fingers alike or each by itself, and of its way back."""
 
 import warp as wp
 
+from lgrasp.grasp.bounds import ANY_PENETRATION
 from lgrasp.grasp.check_kernels import hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Limits, Packed
-from lgrasp.grasp.collision import body_apart, body_height, resting_plane
+from lgrasp.grasp.collision import body_apart, body_depth, body_height, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward, vec_dof
@@ -19,6 +20,9 @@ OPENING_SHARES = wp.constant(5)
 FINGER_TRIES = wp.constant(3 * OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
 _NOT_TOUCHING = wp.constant(1.0e6)  # opening of a hand no finger of which touches
+_CLOSED = wp.constant(2.0 / 3.0)  # of the way from q_pregrasp to q
+_DEEPEST = wp.constant(ANY_PENETRATION)  # [m]
+_NEAR = wp.constant(0.002)  # [m] bodies whose samples are farther from the object do not penetrate
 
 
 @wp.func
@@ -271,3 +275,42 @@ def open_fingers(
         if at.chosen[s, g] >= 0:
             least = wp.min(least, moved)
     put_opening(i, least, most, packed_out)
+
+
+@wp.kernel
+def measure_closing(
+    hand: Hand,
+    obj: Object,
+    at: CheckedPostures,
+    row: wp.array(dtype=wp.int32),
+    packed_out: Packed,
+):
+    """Deepest penetration [m] of fingers and object two thirds of the straight way from ``q_pregrasp`` to ``q``: a
+    finger that goes through the object pushes it away.
+
+    One thread per (group, row); ``closing_penetration`` grows to the largest.
+
+    Args:
+        row: (m,) hand of each row, -1 none.
+    """
+    g, i = wp.tid()
+    s = row[i]
+    if s < 0:
+        return
+    q = at.posture[s, g]
+    x = q
+    first = hand.kin.dof_first[g]
+    for d in range(hand.kin.dof_first[g + 1] - first):
+        x[d] = packed_out.q_pregrasp[i, hand.kin.dof_index[first + d]]
+    if joint_motion(hand, g, x, q) == 0.0:
+        return
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    group_forward(hand.kin, g, x + _CLOSED * (q - x), X, hand.kin.joint_first[g])
+    T_object = wp.transform_inverse(at.pose[at.of[s]])
+    deepest = float(0.0)
+    for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
+        T = T_object * X[j]
+        if not body_apart(hand, obj, 1 + j, T, _NEAR):
+            deepest = wp.max(deepest, body_depth(hand, obj, 1 + j, T, _DEEPEST))
+    if deepest > 0.0:
+        wp.atomic_max(packed_out.closing_penetration, i, deepest)

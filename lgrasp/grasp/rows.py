@@ -19,6 +19,7 @@ METRIC_UNITS = {
     "squeeze_travel": "m",
     "stable_squeeze": "N",
     "closing_travel": "rad or m",
+    "closing_penetration": "m",
     "hold_drift": "m",
     "failed_bound": CODE + ", ".join(f"{code} {name}" for code, name in enumerate(FAILED_BOUNDS)),
 }

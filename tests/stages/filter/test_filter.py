@@ -9,6 +9,7 @@ from support.wrench import residual
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.outcomes import REASONS
 from lgrasp.grasp.stability_kernels import CONTACT_STIFFNESS, MOST_SQUEEZE
 from lgrasp.grasp.tables import ContactSets
@@ -225,6 +226,25 @@ def test_grasps_that_close_from_far_away_are_dropped_where_asked(tables, context
     most = float(np.quantile(travel, 0.7))
     bound = run(tables.search, params, replace(context, bounds=context.bounds.changed(max_closing_travel=most)))
     kept = travel <= np.float32(most)
+    assert bound[1]["squeeze"] == (~kept).sum() > 10
+    np.testing.assert_array_equal(free.q[kept], bound[0].q)
+
+
+def test_grasps_that_close_through_the_object_are_dropped_where_asked(tables, context, swift):
+    params, bounds = swift.params("filter"), context.bounds
+    # no room to open: the way begins in the object
+    shut = replace(context, bounds=bounds.changed(pregrasp_distance=0.0, max_penetration=0.01, allowed_penetration=0.01))
+    free = run(tables.search, params, shut)[0]
+    closing = free.metrics["closing_penetration"]
+    q = free.q_pregrasp + np.float32(2 / 3) * (free.q - free.q_pregrasp)
+    contacts = known_contacts(free.contact_links, free.contact_points, free.contact_normals, context.device)
+    there = check_grasps(context.hand, context.object, free.pose, q, contacts, bounds)[0].metrics["penetration"]
+    moved = (free.q != free.q_pregrasp).any(1)
+    assert (closing[~moved] == 0).all()
+    assert (closing <= there + 1e-6).all()
+    most = float(np.quantile(closing, 0.7))
+    bound = run(tables.search, params, replace(shut, bounds=shut.bounds.changed(max_closing_penetration=most)))
+    kept = closing <= np.float32(most)
     assert bound[1]["squeeze"] == (~kept).sum() > 10
     np.testing.assert_array_equal(free.q[kept], bound[0].q)
 
