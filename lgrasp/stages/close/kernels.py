@@ -30,6 +30,16 @@ class CloseCount(IntEnum):
     TOUCHING = 1
 
 
+@wp.struct
+class CloseValues:
+    """CloseParams and GraspBounds as kernels read them, but for what they share with stage wrap."""
+
+    steps: wp.int32
+    settings: wp.int32
+    min_contacts: wp.int32
+    record: wp.array(dtype=wp.int32)  # (r,) a contact vector of the field for each run of points that may touch
+
+
 @wp.func
 def _shares(hand: Hand, g: wp.int32):
     """True if joints of a finger are shared with others."""
@@ -145,9 +155,8 @@ def _close(
     hand: Hand,
     obj: Object,
     runs: PalmarRuns,
-    record: wp.array(dtype=wp.int32),
     params: WrapValues,
-    steps: wp.int32,
+    closing: CloseValues,
     row: wp.int32,
     g: wp.int32,
     setting: wp.int32,
@@ -160,7 +169,7 @@ def _close(
     touch = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
     candidates_out.count[row, g] = 0
     wp.atomic_add(counts_out, int(CloseCount.TRIED), 1)
-    q, i = _touching(hand, obj, runs, params, steps, g, setting, pose, X, touch)
+    q, i = _touching(hand, obj, runs, params, closing.steps, g, setting, pose, X, touch)
     plane = resting_plane(obj, pose, candidates_out.poses.resting[row])
     if i < 0 or not thumb_placed(hand, g, X, 0) or not finger_above(hand, g, X, plane, params.min_table_distance):
         return int(0)
@@ -171,7 +180,7 @@ def _close(
         return int(0)
     candidates_out.count[row, g] = 1
     candidates_out.surface[row, g, 0] = surface
-    candidates_out.record[row, g, 0] = record[r]
+    candidates_out.record[row, g, 0] = closing.record[r]
     candidates_out.q[row, g, 0] = q
     candidates_out.state[row, g, 0] = int(State.REALISED)
     wp.atomic_add(counts_out, int(CloseCount.TOUCHING), 1)
@@ -183,11 +192,8 @@ def close_fingers(
     hand: Hand,
     obj: Object,
     runs: PalmarRuns,
-    record: wp.array(dtype=wp.int32),
     params: WrapValues,
-    steps: wp.int32,
-    settings: wp.int32,
-    min_contacts: wp.int32,
+    closing: CloseValues,
     candidates_out: Candidates,
     setting_out: wp.array(dtype=wp.int32),
     counts_out: wp.array(dtype=wp.int32),
@@ -198,10 +204,6 @@ def close_fingers(
 
     Args:
         runs: points of links that may touch.
-        record: a contact vector of the field for each run, (r,).
-        steps: of a finger from wide open to closed.
-        settings: most settings that are tried.
-        min_contacts: of a grasp, the palm's one of them.
         setting_out: the last that was tried, (P,).
         counts_out: CloseCount, (2,).
     """
@@ -220,12 +222,12 @@ def close_fingers(
     left = groups - sharing
     for g in range(groups):
         if not _shares(hand, g):
-            if alone + left + sharing >= min_contacts:
-                alone += _close(hand, obj, runs, record, params, steps, row, g, own, candidates_out, counts_out)
+            if alone + left + sharing >= closing.min_contacts:
+                alone += _close(hand, obj, runs, params, closing, row, g, own, candidates_out, counts_out)
             left -= 1
     made = alone
-    for k in range(wp.min(settings, hand.kin.settings)):
-        if alone + sharing < min_contacts or (k > 0 and made >= min_contacts):
+    for k in range(wp.min(closing.settings, hand.kin.settings)):
+        if alone + sharing < closing.min_contacts or (k > 0 and made >= closing.min_contacts):
             break
         setting = own - own % hand.kin.settings + (own + k) % hand.kin.settings
         setting_out[row] = setting
@@ -234,6 +236,6 @@ def close_fingers(
         for g in range(groups):
             if _shares(hand, g):
                 candidates_out.count[row, g] = 0
-                if made + left >= min_contacts:
-                    made += _close(hand, obj, runs, record, params, steps, row, g, setting, candidates_out, counts_out)
+                if made + left >= closing.min_contacts:
+                    made += _close(hand, obj, runs, params, closing, row, g, setting, candidates_out, counts_out)
                 left -= 1

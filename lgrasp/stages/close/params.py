@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from lgrasp.config import Params
-from lgrasp.stages.least_squares import Gap
+from lgrasp.stages.least_squares import Gap, Indentation
 
 
 class CloseParams(Params):
@@ -18,9 +18,7 @@ class CloseParams(Params):
     )
     steps: int = Field(default=10, ge=1, le=1000, description="Steps of a finger from wide open to closed.")
     iterations: int = Field(default=6, ge=1, le=100, description="Most Newton steps until a link touches.")
-    contact_indentation: float = Field(
-        default=0.0003, ge=0, le=0.002, description="How far fingers aim to press in at a contact."
-    )
+    contact_indentation: Indentation = 0.0003
     gap: Gap = 0.0007
     settings: int = Field(
         default=8,

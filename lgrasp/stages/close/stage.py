@@ -10,8 +10,9 @@ from lgrasp.grasp.predicted import record_of_points
 from lgrasp.grasp.structs import vec_further
 from lgrasp.grasp.tables import CandidateTable, PoseTable
 from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.structs import make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
-from lgrasp.stages.close.kernels import CloseCount, close_fingers
+from lgrasp.stages.close.kernels import CloseCount, CloseValues, close_fingers
 from lgrasp.stages.close.params import CloseParams
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.stage import allowed_runs
@@ -33,24 +34,11 @@ def run(inputs: PoseTable, params: CloseParams, context: Context) -> tuple[Candi
     tally = empty_tally(CloseCount, d)
     none = wp.empty((0, 0, 0), dtype=vec_further, device=d)
     table = CandidateTable.empty(d, n, groups, 1, poses=replace(inputs, setting=wp.clone(inputs.setting)), further=none)
-    values = wrap_values(WrapParams(**params.model_dump(exclude={"joints", "steps", "settings"})), context.bounds)
+    values = wrap_values(WrapParams(**params.model_dump(include={*WrapParams.model_fields})), context.bounds)
     runs = allowed_runs(context)
-    asked = [
-        context.hand.struct,
-        context.object.struct,
-        runs,
-        _records(runs, context),
-        values,
-        params.steps,
-        params.settings,
-    ]
-    wp.launch(
-        close_fingers,
-        n,
-        [*asked, context.bounds.min_contacts],
-        [table.struct, table.poses.setting, tally.device],
-        device=d,
-    )
+    closing = make_struct(CloseValues, params, context.bounds, record=_records(runs, context))
+    asked = [context.hand.struct, context.object.struct, runs, values, closing]
+    wp.launch(close_fingers, n, asked, [table.struct, table.poses.setting, tally.device], device=d)
     return table, tally
 
 
