@@ -122,6 +122,7 @@ _STAGES = {
     "domain": "Find the contacts that each finger can make at each pose.",
     "ik": "Move fingers to their contacts and keep those that do not collide with the object.",
     "wrap": "Lay further links of the touching fingers on the object.",
+    "close": "Close fingers until they touch the object.",
     "search": "Combine contacts into sets that balance.",
     "adjust": "Move object and fingers together until the contacts of a set are made.",
     "filter": "Complete the grasps and check them exactly.",
@@ -130,7 +131,7 @@ _STAGES = {
 
 
 def _up_to(stage: str):
-    usual = {"hold": "robust-hold", "wrap": "power"}.get(stage, "robust")
+    usual = {"hold": "robust-hold", "wrap": "power", "close": "power"}.get(stage, "robust")
 
     def run(
         mesh: Mesh,

@@ -117,10 +117,10 @@ def cache_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def load(swift: Pipeline, cache_root: Path) -> Callable[..., Inputs]:
-    """load(object) or load(object, pipeline): hand, object and field on the CPU."""
+    """load(object), load(object, pipeline) or load(object, pipeline, hand): hand, object and field on the CPU."""
 
-    def load(name: str = OBJECT, pipeline: Pipeline = swift) -> Inputs:
-        keys = input_keys(find_hand("allegro"), name, 1.0, pipeline.object, pipeline.field, pipeline.hand)
+    def load(name: str = OBJECT, pipeline: Pipeline = swift, hand: str = "allegro") -> Inputs:
+        keys = input_keys(find_hand(hand), name, 1.0, pipeline.object, pipeline.field, pipeline.hand)
         cache = Cache(cache_root, pytest.fail)
         parts = keys, 1.0, pipeline.object, pipeline.field, resolve_device("cpu")
         return load_inputs(cache, *parts, table=pipeline.on_table, steer=pipeline.steer)

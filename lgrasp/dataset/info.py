@@ -90,6 +90,7 @@ SURVIVORS = {
     "domain": "rich",
     "ik": "kept",
     "wrap": "wrapped",
+    "close": "touching",
     "search": "sets",
     "adjust": "kept",
     "filter": "kept",

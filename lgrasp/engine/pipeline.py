@@ -66,13 +66,14 @@ class Pipeline(_Head):
 
     @property
     def realised(self) -> bool:
-        """True if ik comes before search."""
-        return "ik" in self.order and self.order.index("ik") < self.order.index("search")
+        """True if ik or close comes before search."""
+        before = self.order[: self.order.index("search")]
+        return "ik" in before or "close" in before
 
     @property
     def open_to_hands(self) -> bool:
-        """True if it has both ik and adjust: a hand decides which of them it runs."""
-        return {"ik", "adjust"} <= {*self.order}
+        """True if it has ik and also adjust or close: a hand decides which of them it runs."""
+        return "ik" in self.order and bool({"adjust", "close"} & {*self.order})
 
     @property
     def on_table(self) -> bool:
@@ -105,20 +106,24 @@ class Pipeline(_Head):
         return self.model_copy(update={"stages": stages})
 
     def suited(self, joints: float) -> "Pipeline":
-        """A copy with one of stages ik and adjust where it is open to hands.
+        """A copy with one of stages ik, adjust and close where it is open to hands.
 
         Args:
             joints: of its own that a finger of the hand has on the mean.
         """
         if not self.open_to_hands:
             return self
+        if "close" in self.order:
+            closes = joints <= self.params("close").joints
+            return self.without("domain", "ik", "wrap") if closes else self.without("close")
         adjusts = joints <= self.params("adjust").joints and not self.poses_stay
         return self.without("ik" if adjusts else "adjust")
 
-    def without(self, stage: str) -> "Pipeline":
-        """A copy that lacks a stage; without ik contacts are drawn once."""
-        kept = self.model_copy(update={"stages": tuple(s for s in self.stages if s[0] != stage)})
-        return kept.with_params("domain", rounds=1) if stage == "ik" and stage in self.order else kept
+    def without(self, *stages: str) -> "Pipeline":
+        """A copy that lacks stages; without ik contacts are drawn once."""
+        kept = self.model_copy(update={"stages": tuple(s for s in self.stages if s[0] not in stages)})
+        once = "ik" in stages and "ik" in self.order and "domain" in kept.order
+        return kept.with_params("domain", rounds=1) if once else kept
 
     def with_bounds(self, **changes: Any) -> "Pipeline":
         """A copy with some of the bounds replaced and checked.

@@ -45,6 +45,7 @@ STAGES: dict[str, Stage] = {
     "domain": Stage("domain", "lgrasp.stages.domain", "DomainParams"),
     "ik": Stage("ik", "lgrasp.stages.ik", "IkParams"),
     "wrap": Stage("wrap", "lgrasp.stages.wrap", "WrapParams"),
+    "close": Stage("close", "lgrasp.stages.close", "CloseParams"),
     "search": Stage("search", "lgrasp.stages.search", "SearchParams"),
     "adjust": Stage("adjust", "lgrasp.stages.adjust", "AdjustParams"),
     "filter": Stage("filter", "lgrasp.stages.filter", "FilterParams"),
@@ -59,12 +60,15 @@ SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
 ORDERS = (
     ("place", "domain", "ik", "search", "filter"),
     ("place", "domain", "ik", "wrap", "search", "filter"),
+    ("place", "close", "search", "filter"),
+    ("place", "domain", "ik", "wrap", "close", "search", "filter"),
     ("place", "domain", "search", "adjust", "filter"),
     ("place", "domain", "search", "ik", "filter"),
     ("place", "domain", "ik", "search", "adjust", "filter"),
 )
-"""Accepted orders: contacts realised before they are combined, fingers perhaps wrapped; or after, by object and fingers
-together, or (the published order) finger by finger. Of ik and adjust a job leaves the one that suits its hand."""
+"""Accepted orders: contacts realised before they are combined, fingers perhaps wrapped, or closed; or after, by object
+and fingers together, or (the published order) finger by finger. Of ik and adjust, or close, a job leaves the one that
+suits its hand."""
 
 OPTIONAL = ("refine", "hold", "simulate")
 """Stages that may follow, in this order: grasps are refined, tried, simulated."""

@@ -82,7 +82,8 @@ def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, flo
 def _most_candidates(device: str, groups: int, pipeline: Pipeline) -> int:
     """Candidates that a batch may have on a GPU: it takes at most a quarter of the memory that is free now."""
     free = wp.get_device(device).free_memory
-    tables = _CONTACT_BYTES * pipeline.params("domain").keep + _SET_BYTES * pipeline.params("search").per_pose
+    keep = pipeline.params("domain").keep if "domain" in pipeline.order else 1
+    tables = _CONTACT_BYTES * keep + _SET_BYTES * pipeline.params("search").per_pose
     return int(min(max(free / 4 / (max(_GROUP_BYTES, tables) * groups), _GPU_SMALLEST), _GPU_LARGEST))
 
 

@@ -9,6 +9,7 @@ _STEPS = (
     ),
     ("domain", "poses", "rich", "too few fingers can reach the object's surface at these poses"),
     ("ik", "tried", "kept", "fingers cannot put their contact surface on the object without hitting it"),
+    ("close", "tried", "touching", "fingers do not touch the object as they close, or with an edge"),
     ("search", "poses", "yielding", "the contacts within reach do not balance, or the fingers would hit each other"),
     ("filter", "", "kept", "finished grasps collide"),
     ("hold", "tried", "held", "grasps lose the object when it is pulled"),

@@ -27,8 +27,8 @@ def hand_source(name: str) -> HandSource:
 
 def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
     """A pipeline whose grasp type, sides of links, thumb and pose policy, if asked for, are those of a hand, with the
-    one of stages ik and adjust that suits its fingers; one line tells where it asks for more contacts than the hand has
-    fingers and palm, and it then asks for so many.
+    one of stages ik, adjust and close that suits its fingers; one line tells where it asks for more contacts than the
+    hand has fingers and palm, and it then asks for so many.
 
     Raises:
         HandError: no such hand.

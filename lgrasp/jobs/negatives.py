@@ -84,4 +84,5 @@ def _loosened(pipeline: Pipeline) -> Pipeline:
     own = pipeline.bounds
     wider = {n: max(x, getattr(own, n)) if n.startswith(("max", "allowed")) else x for n, x in _LOOSE.items()}
     loose = pipeline.with_bounds(**wider)
-    return loose.with_params("search", check_depth=False, passes=1).with_params("domain", rounds=1)
+    loose = loose.with_params("search", check_depth=False, passes=1)
+    return loose.with_params("domain", rounds=1) if "domain" in loose.order else loose

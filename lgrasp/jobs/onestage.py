@@ -22,6 +22,13 @@ from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
 from lgrasp.runtime.tally import Meter
 
+_ELSE = {
+    **dict.fromkeys(("domain", "ik", "wrap"), ("adjust", "close")),
+    "adjust": ("ik",),
+    "close": ("domain", "ik", "wrap"),
+}
+"""Stages that a hand has in place of others, and these."""
+
 
 @dataclass(frozen=True)
 class StageRun:
@@ -62,8 +69,8 @@ def run_up_to(
         raise ConfigError(f"--first {first} --candidates {count} --shard-index {shard}: need 0, 1 and 0 or more")
     if last not in pipeline.order:
         raise ConfigError(f"pipeline {pipeline.name} has no stage {last}; its stages: {', '.join(pipeline.order)}")
-    if pipeline.open_to_hands and last in ("ik", "adjust"):
-        pipeline = pipeline.without("adjust" if last == "ik" else "ik")
+    if pipeline.open_to_hands and last in _ELSE:
+        pipeline = pipeline.without(*_ELSE[last])
     pipeline, used = for_hand(pipeline, hand), resolve_device(device)
     keys = input_keys(hand_source(hand), mesh, scale, pipeline.object, pipeline.field, pipeline.hand)
     stages = pipeline.order[: pipeline.order.index(last) + 1]

@@ -6,4 +6,5 @@ from pydantic import Field
 
 Damping = Annotated[float, Field(gt=0, le=1, description="Damping of the least squares.")]
 JointStep = Annotated[float, Field(gt=0, le=3, description="Largest joint change in one step [rad or m].")]
+Indentation = Annotated[float, Field(ge=0, le=0.002, description="How far fingers aim to press in at a contact.")]
 Gap = Annotated[float, Field(gt=0, le=0.01, description="Largest difference from that.")]

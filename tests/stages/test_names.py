@@ -13,7 +13,7 @@ from lgrasp.engine.registry import OPTIONAL, ORDERS, STAGES
 PAGE = ROOT / "docs" / "guides" / "pipeline.md"
 
 
-CHOSEN = ("ik", "wrap", "adjust")
+CHOSEN = ("domain", "ik", "wrap", "close", "adjust")
 """Stages that some pipelines lack."""
 
 

@@ -87,7 +87,7 @@ def _batch(
         table = run_stage(stage, table, once, context, meter)
     early = select_poses(table, np.arange(len(index)), context.device)  # later rounds write where the first did
     order, found, last = pipeline.order, poses, "place"
-    if pipeline.realised:
+    if pipeline.realised and "ik" in order:
         for number in range(1, pipeline.params("domain").rounds):
             for stage in ("domain", "ik"):
                 table = run_stage(stage, table, once, context.changed(round=number), meter)

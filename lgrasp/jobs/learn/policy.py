@@ -136,7 +136,7 @@ class PolicyJob(PolicyRequest, FileJob):
         learned = self.learned
         own = {"bounds": learned.bounds, "realised": learned.realised}
         context = Context(self._hand, obj, self._field, alias, p.seed, number, **own)
-        return make_pose_examples(learned, self.pipeline.without("adjust"), context, points, p)
+        return make_pose_examples(learned, self.pipeline.without("adjust", "close"), context, points, p)
 
     def _object(self, number: int) -> ObjectModel:
         params, alias = self.pipeline.object, self.device_used.alias

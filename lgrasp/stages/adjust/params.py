@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from lgrasp.config import Params
-from lgrasp.stages.least_squares import Damping, Gap, JointStep
+from lgrasp.stages.least_squares import Damping, Gap, Indentation, JointStep
 
 
 class AdjustParams(Params):
@@ -36,8 +36,6 @@ class AdjustParams(Params):
     step: JointStep = 0.3
     object_step: float = Field(default=0.01, gt=0, le=0.1, description="Largest move of the object in one step.")
     object_turn: float = Field(default=10.0, gt=0, le=90, description="Largest turn of the object in one step [deg].")
-    contact_indentation: float = Field(
-        default=0.0003, ge=0, le=0.002, description="How far fingers aim to press in at a contact."
-    )
+    contact_indentation: Indentation = 0.0003
     gap: Gap = 0.001
     angle: float = Field(default=15.0, gt=0, le=60, description="Largest angle of the normals at a contact [deg].")

@@ -84,7 +84,7 @@ def _take_all(check: Check, context: Context) -> None:
     """Contacts of further links that touch join those that search combined."""
     d, n, hand = context.device, len(check), context.hand.struct
     pose, q = placed_postures(check)
-    runs = _allowed_runs(context)
+    runs = allowed_runs(context)
     found = touching_links(context.hand, context.object, check.limits, runs, pose, q)
     inputs = [hand, check.limits, check.places, runs, *found]
     wp.launch(take_contacts, n, inputs, [check.at, check.found], device=d)
@@ -105,7 +105,7 @@ def _postures(inputs: ContactSets, width: int, context: Context) -> CheckedPostu
     return empty_struct(CheckedPostures, d, n, model.groups, body=body, contact=contact, surface=surface, **given)
 
 
-def _allowed_runs(context: Context) -> PalmarRuns:
+def allowed_runs(context: Context) -> PalmarRuns:
     """The contact surface of the hand as far as a steering lets it touch; made once for a job."""
 
     def make() -> PalmarRuns:

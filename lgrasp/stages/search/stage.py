@@ -89,11 +89,14 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     # starts in rounds: poses that have their sets stop early, and a GPU still has enough threads
     paced = exact or (swap and _bounds_load(values))
     few = _CPU_STARTS if d == "cpu" and not paced else _GPU_STARTS
-    lanes = min(params.restarts, few if params.per_pose < params.restarts else params.restarts)
-    room = empty_struct(TriedSets, d, n, min(params.restarts, max(lanes, _MOST_STARTS)) if paced else lanes, groups)
+    starts = params.restarts
+    if swap:  # no more than there are sets
+        starts = min(starts, sum(math.comb(groups, k) * keep**k for k in {*params.contacts}))
+    lanes = min(starts, few if params.per_pose < starts else starts)
+    room = empty_struct(TriedSets, d, n, min(starts, max(lanes, _MOST_STARTS)) if paced else lanes, groups)
     first = 0
-    while n and first < params.restarts:
-        lanes = min(max(lanes, min(first // 2, _MOST_STARTS if paced else 0)), params.restarts - first)
+    while n and first < starts:
+        lanes = min(max(lanes, min(first // 2, _MOST_STARTS if paced else 0)), starts - first)
         tried = make_struct(TriedSets, room, score=room.score[:, :lanes])
         values.per_pose = params.per_pose - (params.taper * params.per_pose * first) // params.restarts
         # none at first, so that poses are given up by sets of any

@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.find_contacts import palmar_runs
 from lgrasp.grasp.structs import vec_further
@@ -34,20 +36,24 @@ def run(inputs: CandidateTable, params: WrapParams, context: Context) -> tuple[C
     d = context.device
     tally = empty_tally(WrapCount, d)
     table = replace(inputs, further=wp.empty(inputs.surface.shape, dtype=vec_further, device=d))
-    bounds = context.bounds
-    angles = {
-        "cosine": bounds.max_normal_angle - _NORMAL_MARGIN,
-        "min_cosine": bounds.max_normal_angle,
-        "min_spread_cosine": bounds.max_normal_spread,
-    }
-    least = {name: math.cos(math.radians(angle)) for name, angle in angles.items()}
-    values = make_struct(WrapValues, params, bounds, **least)
+    values = wrap_values(params, context.bounds)
     asked = [context.hand.struct, context.field.struct, context.object.struct, context.held.struct, _probes(context)]
     shape, listed = inputs.surface.shape, wp.empty(inputs.surface.size, dtype=wp.int32, device=d)
     wp.launch(list_realised, shape, [table.struct], [listed, tally.device], device=d)
     kernel = wrap_fingers[context.hand.model.tree.dof_size]
     wp.launch(kernel, listed.shape, [*asked, values, listed], [table.struct, tally.device], device=d)
     return table, tally
+
+
+def wrap_values(params: WrapParams, bounds: GraspBounds) -> Any:
+    """The struct WrapValues."""
+    angles = {
+        "cosine": bounds.max_normal_angle - _NORMAL_MARGIN,
+        "min_cosine": bounds.max_normal_angle,
+        "min_spread_cosine": bounds.max_normal_spread,
+    }
+    least = {name: math.cos(math.radians(angle)) for name, angle in angles.items()}
+    return make_struct(WrapValues, params, bounds, **least)
 
 
 def _probes(context: Context) -> PalmarRuns:

@@ -1,0 +1,122 @@
+"""close: fingers close until they touch; a case in closed form, and contacts of a hand measured on its solids."""
+
+import numpy as np
+import pytest
+import trimesh
+from support.urdfs import gripper
+
+from lgrasp.engine.batch import run_batch, run_stages
+from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.shard import shard_context
+from lgrasp.field.arrays import upload_field
+from lgrasp.field.build import build_field
+from lgrasp.field.params import FieldParams
+from lgrasp.grasp.tables import PoseTable
+from lgrasp.hand.arrays import upload_hand
+from lgrasp.hand.build import build_hand
+from lgrasp.hand.spec import Box, ContactRule, HandSpec
+from lgrasp.jobs.hands import for_hand
+from lgrasp.object.arrays import upload_object
+from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
+from lgrasp.stages.close.params import CloseParams
+from lgrasp.stages.close.stage import run
+from lgrasp.stages.context import Context
+
+RADIUS = 0.02  # [m]
+EXACT = CloseParams(gap=2e-5, contact_indentation=0.0)
+
+
+@pytest.fixture(scope="module")
+def jaws_and_ball(tmp_path_factory, device):
+    """Two jaws that slide along x from where they meet, 0.05 m each at most, and a ball."""
+    spec = HandSpec(
+        name="jaws",
+        contact=(ContactRule(links=("jaw_l", "jaw_r")),),
+        canonical_box=Box(min=(-0.03, -0.01, 0.04), max=(0.03, 0.01, 0.08)),
+        open_posture={"l": 0.04, "r": 0.04},
+    )
+    model = build_hand(gripper(tmp_path_factory.mktemp("jaws")), spec)
+    obj = preprocess_object(trimesh.creation.icosphere(4, RADIUS), params=ObjectParams(contact_count=2048))
+    hand = upload_hand(model, device)
+    field = upload_field(build_field(hand, FieldParams(records=2000)), model, device)
+    return Context(hand, upload_object(obj, device), field, device, 0, 0)
+
+
+def ball_at(context, *places):
+    """Poses of the ball, moves alone (n, 3) [m]."""
+    n = len(places)
+    arrays = {name: np.zeros(n, np.int32) for name in ("index", "setting")}
+    arrays |= {name: np.full(n, -1, np.int32) for name in ("palm_point", "palm_surface", "resting")}
+    turn = np.tile([0, 0, 0, 1], (n, 1))
+    arrays |= {"pose": np.concatenate([places, turn], 1).astype(np.float32)}
+    return PoseTable.of(arrays | {"anchor": np.full((n, 2), -1, np.int32)}, context.device)
+
+
+def test_jaws_close_on_a_ball(jaws_and_ball):
+    places = [(0.004, 0, 0.06), (-0.01, 0.002, 0.055), (0.0, 0.2, 0.06)]
+    table, counts = run(ball_at(jaws_and_ball, *places), EXACT, jaws_and_ball)
+    after = table.arrays()
+    # at the last one the first jaw finds nothing, and the second cannot make up for it
+    assert dict(counts) == {"tried": 5, "touching": 4}
+    np.testing.assert_array_equal(after["count"], [[1, 1], [1, 1], [0, 0]])
+    model, obj = jaws_and_ball.hand.model, jaws_and_ball.object.model
+    for row in range(2):
+        for g in range(2):
+            c = jaws_and_ball.field.model.point[after["record"][row, g, 0]]
+            assert model.tree.body_group[model.contact_body[c]] == g
+            point = obj.contact_points[after["surface"][row, g, 0]]
+            side = np.sign(point[0])
+            assert abs(point[0]) == pytest.approx(RADIUS, abs=5e-4)
+            # jaws that meet at x = 0 have come off as far as the ball reaches
+            assert after["q"][row, g, 0, 0] == pytest.approx(RADIUS + side * places[row][0], abs=1e-4)
+
+
+@pytest.fixture(scope="module")
+def power():
+    return for_hand(load_pipeline("power"), "barrett")
+
+
+@pytest.fixture(scope="module")
+def barrett(load, power):
+    return load("capsule", power, "barrett")
+
+
+def test_the_hand_decides(power):
+    assert power.order == ("place", "close", "search", "filter")
+    assert for_hand(load_pipeline("power"), "allegro").order == ("place", "domain", "ik", "wrap", "search", "filter")
+    asked = load_pipeline("power").with_params("close", joints=0.0)
+    assert "close" not in for_hand(asked, "barrett").order
+
+
+def test_rows_wrap_the_object(power, barrett):
+    """Three fingers and the palm at least, in postures of some setting of the spread, and the same in other batches."""
+    context = shard_context(power, barrett, 0)
+    rows = run_batch(power, context, 0, 256).grasps
+    assert len(rows) >= 10
+    tree = barrett.hand.model.tree
+    groups = np.array([tree.group_of(name) for name in tree.link_names])
+    for links in rows.contact_links:
+        assert set(groups[links[links >= 0]]) == {-1, 0, 1, 2}
+    spread = tree.settings[:, tree.joint_names.index("finger_1_prox_joint")]
+    used = rows.q[:, tree.joint_names.index("finger_1_prox_joint")]
+    assert np.abs(used[:, None] - spread).min(1).max() < 1e-6
+    assert len(np.unique(used)) > 2
+    again = run_batch(power, context, 128, 128).grasps
+    np.testing.assert_array_equal(again.q, rows.q[rows.index >= 128])
+
+
+def test_fingers_have_the_setting_of_their_pose(power, barrett):
+    context = shard_context(power, barrett, 0)
+    table = run_stages(power, context, 0, 64, "close").arrays()
+    poses = run_stages(power, context, 0, 64, "place").arrays()
+    np.testing.assert_array_equal(table["poses.pose"], poses["pose"])
+    assert (table["poses.setting"] != poses["setting"]).any()
+    row, group = np.nonzero(table["count"])
+    assert len(row) > 20
+    # q of a candidate has the setting of its pose
+    first, free = context.hand.model.tree.dof_first[group], context.hand.model.tree.dof_free[group]
+    shared = np.flatnonzero(free < context.hand.model.tree.dof_first[group + 1] - first)
+    open_ = context.hand.model.tree.settings[table["poses.setting"][row]]
+    column = context.hand.model.tree.dof_index[(first + free)[shared]]
+    np.testing.assert_allclose(table["q"][row, group, 0][shared, free[shared]], open_[shared, column], atol=1e-6)
