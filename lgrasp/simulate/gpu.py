@@ -1,5 +1,6 @@
 """Verdicts of many grasps at once with MuJoCo Warp: worlds side by side on one device."""
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -197,7 +198,7 @@ class WorldTrials:
         enough = sum(sim.worlds >= len(waiting) for sim in self._pulled)
         smaller = self._pulled[max(enough - 1, 0) :][::-1]
         sim = smaller.pop()
-        total = max(1, round(self._protocol.hold / CHUNK))
+        total = max(1, math.ceil(self._protocol.hold / CHUNK - 1e-6))
         job: np.ndarray = np.full((sim.worlds, 2), -1)  # grasp and direction of each world
         done, depth = np.zeros(sim.worlds, int), np.zeros(sim.worlds)
         before, worst = np.zeros((2, sim.worlds, objects, 2))

@@ -11,7 +11,7 @@ import numpy as np
 from lgrasp.geometry.poses import rotated
 from lgrasp.simulate.protocol import Protocol
 
-CHUNK = 0.1
+CHUNK = 0.05
 """[s] between looks at the objects."""
 WILD = 1.0e3
 """[m/s or rad/s]: no hand and no object is so fast, the simulation has diverged."""
