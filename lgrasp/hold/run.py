@@ -1,5 +1,6 @@
 """The hold test of many grasps of one object on a device."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,7 @@ from lgrasp.hold.scratch import MAX_HAND_DOFS, MAX_TOUCHES, Contact, empty_scrat
 from lgrasp.math.lanes import LANES, lanes_of
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.object.mass import mass_properties
+from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.structs import empty_struct, make_struct, upload_struct
 from lgrasp.simulate.protocol import DIRECTIONS, PROTOCOLS
@@ -66,12 +68,14 @@ class HoldTester:
     Args:
         hand, obj: on one device.
         test: how often, and with what numbers.
+        others: what the object may be as well: draws take it and these in turn; the first trial is of the object.
     """
 
-    def __init__(self, hand: HandArrays, obj: ObjectArrays, test: HoldTest) -> None:
-        self._hand, self._object, self._test = hand, obj, test
-        self._device = hand.device
-        self._course = self._make_course()
+    def __init__(
+        self, hand: HandArrays, obj: ObjectArrays, test: HoldTest, others: Sequence[ObjectArrays] = ()
+    ) -> None:
+        self._hand, self._test, self._device = hand, test, hand.device
+        self._objects = [(one, course_of(one.model, hand.device)) for one in (obj, *others)]
 
     def run(
         self,
@@ -135,12 +139,17 @@ class HoldTester:
 
     def _try(self, grasps: Any, rows: np.ndarray, spread: Any, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whether each of some rows, in a draw each, holds (T,), and its displacement at worst (T,) [m]."""
-        cuts = [slice(at, at + _MOST_TRIALS) for at in range(0, len(rows), _MOST_TRIALS)]
-        parts = [self._launch(grasps, rows[cut], spread, draws[cut]) for cut in cuts]
-        held, drift = zip(*parts, strict=True) if parts else ((np.zeros(0, bool),), (np.zeros(0),))
-        return np.concatenate(held), np.concatenate(drift)
+        held, drift = np.zeros(len(rows), bool), np.zeros(len(rows))
+        for number, (obj, course) in enumerate(self._objects):
+            of_it = np.flatnonzero(draws % len(self._objects) == number)
+            for at in range(0, len(of_it), _MOST_TRIALS):
+                some = of_it[at : at + _MOST_TRIALS]
+                held[some], drift[some] = self._launch(obj, course, grasps, rows[some], spread, draws[some])
+        return held, drift
 
-    def _launch(self, grasps: Any, rows: np.ndarray, spread: Any, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _launch(
+        self, obj: ObjectArrays, course: Any, grasps: Any, rows: np.ndarray, spread: Any, draws: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         n, ways, device = len(rows), len(DIRECTIONS), self._device
         given = {
             "row": wp.array(rows.astype(np.int32), dtype=wp.int32, device=device),
@@ -152,7 +161,7 @@ class HoldTester:
         held = wp.zeros((n, ways), dtype=wp.int32, device=device)
         displacement = wp.zeros((n, ways), dtype=wp.float32, device=device)
         pulls = make_struct(TrialPulls, held=held, displacement=displacement)
-        both = [self._hand.struct, self._object.struct, self._course]
+        both = [self._hand.struct, obj.struct, course]
         # on a GPU every worker pulls one way only
         lanes = lanes_of(device)
         each, most = (1, _WORKERS) if lanes > 1 else (ways, 1)
@@ -167,27 +176,28 @@ class HoldTester:
         stayed, moved = fetch([held, displacement])
         return np.all(stayed, axis=1), np.max(moved, axis=1)
 
-    def _make_course(self) -> Any:
-        fc = PROTOCOLS["fc"]
-        model = self._object.model
-        course = upload_struct(
-            Course,
-            self._device,
-            {
-                "closing_steps": _CLOSING_STEPS,
-                "closing_time": fc.phase / _CLOSING_STEPS,
-                "pull_steps": _PULL_STEPS,
-                "pull_time": fc.hold / _PULL_STEPS,
-                "force": fc.force,
-                "most_displacement": fc.most_displacement,
-                "most_rotation": float(np.radians(fc.most_rotation)),
-                "drive_inertia": _DRIVE_INERTIA,
-                "com": model.com,
-            },
-        )
-        body = mass_properties(model.vertices, model.faces)
-        course.inertia = wp.mat33(*map(float, (body.inertia / body.volume).ravel()))
-        return course
+
+def course_of(model: ObjectModel, device: str) -> Any:
+    """What all trials of an object go through, a Course."""
+    fc = PROTOCOLS["fc"]
+    course = upload_struct(
+        Course,
+        device,
+        {
+            "closing_steps": _CLOSING_STEPS,
+            "closing_time": fc.phase / _CLOSING_STEPS,
+            "pull_steps": _PULL_STEPS,
+            "pull_time": fc.hold / _PULL_STEPS,
+            "force": fc.force,
+            "most_displacement": fc.most_displacement,
+            "most_rotation": float(np.radians(fc.most_rotation)),
+            "drive_inertia": _DRIVE_INERTIA,
+            "com": model.com,
+        },
+    )
+    body = mass_properties(model.vertices, model.faces)
+    course.inertia = wp.mat33(*map(float, (body.inertia / body.volume).ravel()))
+    return course
 
 
 def _fold(number: np.ndarray) -> np.ndarray:

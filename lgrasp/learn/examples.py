@@ -22,6 +22,7 @@ CAMERA = CameraParams.model_validate(
 )
 """Of clouds that networks see."""
 _CAMERA_DISTANCE = 4.0  # of a camera, in radii of the object
+_LEAST_POINTS = 64  # of a cloud: an edge alone is no object
 
 
 class Examples(NamedTuple):
@@ -106,5 +107,5 @@ def seen_cloud(
             continue
         images = render(surface, intrinsics_of(camera), look_at(_CAMERA_DISTANCE * radius * way, np.zeros(3)), device)
         merged = merge_views(add_noise(images, camera, rng), draw_offsets(camera, rng), camera, device)
-        if len(merged.points):
+        if len(merged.points) >= _LEAST_POINTS:
             return merged

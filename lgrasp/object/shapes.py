@@ -12,6 +12,7 @@ from trimesh.transformations import random_rotation_matrix, rotation_matrix
 from lgrasp.choices import ShapeKind
 
 _LARGEST = 0.22  # [m]
+_MOST_FACES = 40_000  # of a solid that is deformed
 _MIX: dict[ShapeKind, float] = {"single": 0.25, "joined": 0.3, "cup": 0.15, "ring": 0.05, "tool": 0.25}
 
 
@@ -34,6 +35,28 @@ def random_shape(
             mesh.apply_scale(rng.uniform(*size) / longest if size else min(1.0, _LARGEST / longest))
             mesh.metadata["name"] = f"{kind or 'shape'}-{seed}-{number}"
             return mesh
+
+
+def deformed_shape(mesh: trimesh.Trimesh, rng: np.random.Generator) -> trimesh.Trimesh:
+    """The same solid stretched along its axes, tapered and waved along the longest of them, and bent across that."""
+    mesh = mesh.copy()
+    thin, middle, along = np.argsort(mesh.extents)
+    while len(mesh.faces) * 4 <= _MOST_FACES and mesh.edges_unique_length.max() > mesh.extents[along] / 16:
+        mesh = mesh.subdivide()
+    x = np.array(mesh.vertices - mesh.bounds.mean(0)) * np.exp(rng.uniform(-0.3, 0.3, 3))
+    length = np.ptp(x[:, along])
+    share = x[:, along] / length
+    taper = 1 + rng.uniform(-0.8, 0.8) * share
+    wave = 1 + rng.uniform(-0.15, 0.15) * np.sin(2 * np.pi * (rng.uniform(0.7, 2) * share + rng.random()))
+    x[:, [thin, middle]] *= (taper * wave)[:, None]
+    across = thin if rng.random() < 0.7 else middle
+    bend = rng.uniform(-1.4, 1.4) * min(1.0, length / (4 * np.ptp(x[:, across])))
+    radius = length / bend
+    out = radius - x[:, across]
+    x[:, across], x[:, along] = radius - out * np.cos(bend * share), out * np.sin(bend * share)
+    mesh.vertices = x
+    mesh.apply_scale(min(1.0, _LARGEST / mesh.extents.max()))
+    return mesh
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:

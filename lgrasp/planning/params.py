@@ -14,6 +14,7 @@ _FEW_FINGERS = 3
 _DRAWN_ROUNDS = 16  # 20 give no more plans that hold, 12 a few fewer
 _PLAN_BOUNDS = GraspBounds(profile="plan")
 _DRAWN_HOLD = 0.75  # six of eight draws
+_UNSURE_HOLD = 0.375  # three
 
 
 class Effort(NamedTuple):
@@ -38,14 +39,7 @@ class PlanParams(Params):
         ge=1,
         le=64,
         description="Hands that a network draws for each start; default: 24, or 40 where a hand has three fingers or "
-        "fewer, which hold less often.",
-    )
-    thicker: float = Field(
-        default=0.005,
-        ge=0,
-        le=0.05,
-        description="How far the sides of a cloud that nobody saw are taken to reach beyond where a network puts them: "
-        "fingers that wait outside close until they touch.",
+        "fewer, or a cloud shows one side, which hold less often.",
     )
     tilts: tuple[float, ...] = Field(
         default=(0.0, 45.0, 90.0),
@@ -64,7 +58,8 @@ class PlanParams(Params):
         default=None,
         ge=1,
         le=1000,
-        description="Matchings of those that continue; default: 16 of 24 that a network draws, else those of `search`.",
+        description="Matchings of those that continue; default: 16 of those that a network draws for more than three "
+        "fingers, else those of `search`.",
     )
     clearance: float = Field(
         default=0.004, ge=0, le=0.1, description="Distance at which the open hand stops before the object."
@@ -95,7 +90,8 @@ class PlanParams(Params):
         ge=0,
         le=64,
         description="Hands of each start that are tried at most, those that resist most first, until one always holds: "
-        "the one that holds most often is the plan. 0: none; default: 8 of those that a network draws, else 10.",
+        "the one that holds most often is the plan. 0: none; default: 8 of those that a network draws, 16 for "
+        "more than three fingers and a cloud of one side, else 10.",
     )
     hold: HoldTest = Field(default=HoldTest(), description="How they are tried.")
     min_hold_probability: float | None = Field(
@@ -103,12 +99,17 @@ class PlanParams(Params):
         ge=0,
         le=1,
         description="Least share of the draws in which a hand that is tried must hold to be a plan, above 0 also in "
-        "the trial without; default: that of `bounds` if it has one, else 0.75 for 24 that a network draws.",
+        "the trial without; default: that of `bounds` if it has one, else 0.75 of those that a network draws for more "
+        "than three fingers, 0.375 if a cloud shows one side, of which several guesses are tried.",
     )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
-    def effort(self, fingers: int | None) -> Effort:
-        """For hands with so many fingers that a network draws, or open ones (None)."""
+    def effort(self, fingers: int | None, unsure: bool = False) -> Effort:
+        """For hands with so many fingers that a network draws, or open ones (None).
+
+        Args:
+            unsure: what the object is, as a camera saw one side of it.
+        """
         own: dict[str, Any] = {"draws": 1, "finalists": 10, "tried": 10}
         own["matching_rounds"] = self.search.matching_rounds
         own["min_hold_probability"] = least = self.bounds.min_hold_probability
@@ -116,7 +117,8 @@ class PlanParams(Params):
             own |= {"draws": 40, "finalists": 24, "tried": 8}
         elif fingers is not None:
             own |= {"draws": 24, "finalists": 12, "tried": 8, "matching_rounds": _DRAWN_ROUNDS}
-            own["min_hold_probability"] = least or _DRAWN_HOLD
+            own |= {"draws": 40, "finalists": 24, "tried": 16} if unsure else {}
+            own["min_hold_probability"] = least or (_UNSURE_HOLD if unsure else _DRAWN_HOLD)
         own |= {name: given for name in own if (given := getattr(self, name)) is not None}
         search = self.search.model_copy(update={"matching_rounds": own.pop("matching_rounds")})
         least = own.pop("min_hold_probability")

@@ -71,6 +71,7 @@ class Planner:
         palmar: where the hand may touch; default: where hand.yaml lets it.
         around: what else the hand must not touch, in the object's internal frame.
         guesses: hands to begin with in place of open ones before the surface, as many of each start as are drawn.
+        others: what the object may be as well: hands are tried on it and these in turn.
     """
 
     hand: HandArrays
@@ -80,6 +81,7 @@ class Planner:
     palmar: ContactSurface | None = None
     around: ObjectModel | None = None
     guesses: Guesses | None = None
+    others: tuple[ObjectModel, ...] = ()
 
     def run(
         self, count: int, progress: Callable[[int, int], None] | None = None, *, keep_invalid: bool = False
@@ -97,7 +99,7 @@ class Planner:
         points = np.arange(count)
         if self.guesses is None:
             points = farthest_points(self.model.contact_points.astype(float), count)
-        each = self.params.rolls if self.guesses is None else self._effort.draws
+        each = self.params.rolls if self.guesses is None else self.effort.draws
         size, workers = (_CPU_STARTS, cores()) if device == "cpu" else (_GPU_HANDS // each, 1)
         counts: dict[str, int] = dict.fromkeys(["starts", "colliding", *REASONS, NOT_HELD], 0)
         tables = []
@@ -117,27 +119,29 @@ class Planner:
                 passed = outcome == Outcome.KEPT
                 table.metrics["valid"] = passed.astype(np.float32)
                 if keep_invalid:
-                    table.metrics["failed_bound"] = failed_bounds(table, outcome, self._effort.bounds)
+                    table.metrics["failed_bound"] = failed_bounds(table, outcome, self.effort.bounds)
                 tables.append(take_grasps(table, np.flatnonzero(passed | keep_invalid)))
                 if progress:
                     progress(counts["starts"], counts["kept"])
         return Planned(join_rows(tables), counts)
 
     @cached_property
-    def _effort(self) -> Effort:
-        return self.params.effort(None if self.guesses is None else self.hand.model.groups)
+    def effort(self) -> Effort:
+        """What the parameters leave to the kind of hands."""
+        return self.params.effort(None if self.guesses is None else self.hand.model.groups, bool(self.others))
 
     @cached_property
     def _scene(self) -> "_Scene":
         device, surface = self.hand.device, hand_surface(self.hand.model, self.palmar, **self.params.weights())
         around = None if self.around is None else upload_object(self.around, device)
         target = upload_target(self.model, self.around, device)
-        obj, search = upload_object(self.model, device), Descent(self.hand, target, self._effort.search, surface)
-        return _Scene(search, obj, around, _tester(self.hand, obj, self._effort.hold))
+        obj, search = upload_object(self.model, device), Descent(self.hand, target, self.effort.search, surface)
+        others = [upload_object(other, device) for other in self.others]
+        return _Scene(search, obj, around, _tester(self.hand, obj, self.effort.hold, others))
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
-        p, bounds, rounds = self.params, self._effort.bounds, self._effort.search.matching_rounds
+        p, bounds, rounds = self.params, self.effort.bounds, self.effort.search.matching_rounds
         start, at = self._opened(search, points, first) if self.guesses is None else self._guessed(points)
         if len(start):
             search.run(at, rounds=min(p.opening, rounds), whole=rounds)
@@ -161,23 +165,23 @@ class Planner:
     def _guessed(self, starts: np.ndarray) -> tuple[np.ndarray, Hands]:
         """Starts, and the hands that were guessed for them."""
         assert self.guesses is not None
-        each = self._effort.draws
+        each = self.effort.draws
         rows = (starts[:, None] * each + np.arange(each)).reshape(-1)
         return starts.repeat(each), self._inverse(self._put(self.guesses.pose[rows], self.guesses.q[rows]))
 
     def _finalists(self, start: np.ndarray, at: Hands) -> tuple[np.ndarray, Hands]:
         """The best hands of each start after the first matchings."""
-        if np.bincount(start).max() <= self._effort.finalists:
+        if np.bincount(start).max() <= self.effort.finalists:
             return start, at
-        found = self._compared(at, _loosened(self._effort.bounds))
+        found = self._compared(at, _loosened(self.effort.bounds))
         place = _places(start, found.unresisted_load + found.penetration / _WHOLE_LOAD)
-        rows = np.flatnonzero(place < self._effort.finalists)
+        rows = np.flatnonzero(place < self.effort.finalists)
         return start[rows], at.taken(rows)
 
     def _steadiest(self, start: np.ndarray, at: Hands) -> tuple[GraspTable, np.ndarray]:
         """One hand of each start, and its outcome: of those tried the one that holds most often, then the one that
         resists most; it is no plan if it holds too rarely."""
-        bounds, tried = self._effort.bounds, self._effort.tried
+        bounds, tried = self.effort.bounds, self.effort.tried
         found = self._compared(at, bounds)
         passed = found.outcome == Outcome.KEPT
         place = _places(start, 2 * ~passed + found.unresisted_load)
@@ -187,7 +191,7 @@ class Planner:
         table, outcome = check_grasps(
             *self._posed(at.taken(rows), bounds), bounds, around=self._scene.around, index=start
         )
-        held, draws = self._held(table, np.where(passed, place, tried)), self._effort.hold.draws
+        held, draws = self._held(table, np.where(passed, place, tried)), self.effort.hold.draws
         often = np.zeros(len(place))
         if held is not None:
             loose = ~bounds.held_by(held) if bounds.min_hold_probability > 0 else False
@@ -207,7 +211,7 @@ class Planner:
         Of each start those at the first places are, until one always holds; twice as many at once each time, since few
         trials keep a GPU as long as many.
         """
-        tester, tried, first = self._scene.tester, self._effort.tried, 0
+        tester, tried, first = self._scene.tester, self.effort.tried, 0
         if tester is None or tried == 0:
             return None
         held = {name: np.zeros(len(place), np.float32) for name in METRICS}
@@ -218,7 +222,7 @@ class Planner:
             rows = np.flatnonzero((place >= first) & (place < last) & ~done)
             if not len(rows):
                 break
-            poses, least = ControlPoses.of(take_grasps(table, rows)), self._effort.bounds.min_hold_probability
+            poses, least = ControlPoses.of(take_grasps(table, rows)), self.effort.bounds.min_hold_probability
             for name, values in tester.run(poses, 0, least=least).items():
                 held[name][rows] = values
             first = last
@@ -277,8 +281,8 @@ class _Scene:
     """None: nothing is known of the object but a plane, which has no mass."""
 
 
-def _tester(hand: HandArrays, obj: ObjectArrays, test: HoldTest) -> HoldTester | None:
+def _tester(hand: HandArrays, obj: ObjectArrays, test: HoldTest, others: list[ObjectArrays]) -> HoldTester | None:
     try:
-        return HoldTester(hand, obj, test)
+        return HoldTester(hand, obj, test, others)
     except ObjectError:
         return None

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from support.holding import ARM, AXIS, CONTACT, RADIUS, STIFF, certain, press
+import trimesh
+from support.holding import ARM, AXIS, CONTACT, HALF, RADIUS, STIFF, certain, press, solid
 
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import ControlPoses, HoldTester
@@ -26,6 +27,21 @@ def test_a_block_slips_at_mu_n_for_any_friction(two_fingers, box, force):
         for share in AROUND
     ]
     assert held == HOLDS
+
+
+def test_draws_take_what_the_object_may_be_in_turn(two_fingers, box):
+    """A block too narrow for the fingers is not held."""
+    test = certain(0.6).model_copy(update={"draws": 4})
+    narrow = solid(trimesh.creation.box((HALF, 0.06, 0.06)))
+    for others, share in (
+        ([], 1.0),
+        ([box], 1.0),
+        ([narrow], 0.5),
+        ([narrow, narrow], 0.5),
+        ([box, box, narrow], 0.75),
+    ):
+        found = HoldTester(two_fingers, box, test, others).run(press([5.0]), 0)
+        assert (found["hold_success"][0], found["hold_probability"][0]) == (1, share)
 
 
 def test_a_block_gives_way_like_two_springs(two_fingers, box):

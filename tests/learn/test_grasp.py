@@ -11,12 +11,13 @@ from lgrasp.geometry.poses import device_matrix
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.learn.diffuser.examples import make_net
 from lgrasp.learn.diffuser.senses import coarse_grid
-from lgrasp.learn.grasp.completion import CompletionNet, unit_nodes, without_specks
-from lgrasp.learn.grasp.completion_training import ViewSet, fit_completion
+from lgrasp.learn.grasp.completion import SHARES, CompletionNet, unit_nodes, without_specks
+from lgrasp.learn.grasp.completion_training import ViewSet, completion_loss, fit_completion, solid_views
 from lgrasp.learn.grasp.examples import first_steps, grasp_examples
 from lgrasp.learn.grasp.file import Networks, load_networks, predictor_bytes
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.grasp.predictor import GraspPredictor
+from lgrasp.learn.grasp.solids import VIEWS, random_solid, random_solids
 from lgrasp.learn.grasp.views import draw_views, make_view
 from lgrasp.learn.networks import network_bytes, open_network
 from lgrasp.object.sdf import sample_sdf
@@ -131,12 +132,46 @@ def test_completing_is_learnt():
     seen = draw_views(cone.vertices, cone.faces, 2, 64, np.random.default_rng(0))
     views = ViewSet(seen, [coarse_grid(cone.vertices, cone.faces, closed=True)], "cpu")
     torch.manual_seed(0)
-    losses: list[float] = []
-    params = PARAMS.model_copy(update={"nodes": 8, "completion_steps": 40, "completion_rate": 1e-2})
-    fit_completion(
-        CompletionNet(4), views, torch.zeros(1, dtype=torch.bool), params, lambda step, loss: losses.append(loss)
-    )
-    assert losses[-1] < 0.95 * losses[0]
+    params = PARAMS.model_copy(update={"nodes": 8, "completion_steps": 80, "completion_rate": 1e-2})
+    net, (cubes, goal) = CompletionNet(4), views.cubes(8)
+
+    def wrong() -> torch.Tensor:
+        """Share of the nodes on the wrong side of each surface."""
+        with torch.no_grad():
+            found = net(cubes.some(torch.arange(2)))
+        assert (found.diff(dim=1) > 0).all()
+        return ((found < 0) != (goal < 0)[:, None]).float().mean((0, 2, 3, 4))
+
+    before = wrong()
+    fit_completion(net, views, params, None)
+    assert (wrong() < 0.8 * before).all()
+
+
+def test_surfaces_are_those_of_their_shares():
+    """Where half of the objects end, and where few of them do, the loss is the least."""
+    n, ends = 8, torch.linspace(-0.2, 0.2, 101)
+    goal = torch.linspace(-0.4, 0.4, n)[None, :, None, None] - ends[:, None, None, None].expand(-1, 1, n, n)
+    found = [torch.linspace(-0.25, 0.25, 51) for _ in SHARES]
+    best = []
+    for k, tried in enumerate(found):
+        losses = []
+        for end in tried:
+            surfaces = torch.zeros(101, len(SHARES), n, n, n) + goal.amax(0)
+            surfaces[:, k] = torch.linspace(-0.4, 0.4, n)[:, None, None] - end
+            losses.append(float(completion_loss(surfaces, goal, n)))
+        best.append(float(tried[int(np.argmin(losses))]))
+    np.testing.assert_allclose(best, [0.2 - 0.4 * share for share in SHARES], atol=0.03)
+
+
+def test_solids_are_seen_as_cameras_see_them():
+    solids = random_solids(0, 3, 64)
+    assert [len(solid.views) for solid in solids] == [VIEWS] * 3
+    again = random_solid(0, 1, 64)
+    np.testing.assert_array_equal(again.grid.values, solids[1].grid.values)
+    views = solid_views(solids, "cpu")
+    at = views.points @ views.R.mT + views.t[:, None]
+    away = views.grids.value(at, (torch.arange(3 * VIEWS) // VIEWS)[:, None]).abs()
+    assert float(away.median()) < 0.002
 
 
 def test_a_grasp_is_in_the_same_place_in_every_view(inputs, networks, views):
@@ -167,7 +202,7 @@ def test_files_are_read_as_written_and_those_that_lie_refused(networks, tmp_path
 
     def refused(words: str, card: dict | None = None, state: dict | None = None):
         path.write_bytes(predictor_bytes(networks))
-        with open_network(path, "grasp", 1) as (was, weights):
+        with open_network(path, "grasp", 2) as (was, weights):
             path.write_bytes(network_bytes(was | (card or {}), weights | (state or {})))
         with pytest.raises(ConfigError, match=words):
             load_networks(path)

@@ -151,7 +151,7 @@ def test_networks_are_known_by_name(generate, cli, monkeypatch, tmp_path):
 def test_grasps_are_planned_from_a_cloud_by_a_network(generate, cli):
     assert generate(rows=64).code == 0
     sizes = ["width=32", "blocks=1", "cloud=64", "shape_points=32", "held_points=32", "sense_points=1", "views=4"]
-    sizes += ["turns=2", "nodes=8", "channels=2", "completion_steps=4", "completion_batch=4", "held_out=0"]
+    sizes += ["turns=2", "nodes=8", "channels=2", "completion_steps=4", "completion_batch=4", "held_out=0", "shapes=2"]
     options = [option for size in sizes for option in ("--set", f"grasp.{size}")]
     fit = ["learn", "fit", "--model", "grasp", "out", "--steps", 4, "--batch", 64, "--device", "cpu", *options]
     done = cli(*fit, "--out", "net.pt", "--json", "fit.json")

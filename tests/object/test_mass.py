@@ -8,9 +8,8 @@ from support.solids import YOU, no_cut, prism
 
 from lgrasp.dataset.metrics import mass_frame
 from lgrasp.errors import ObjectError
-from lgrasp.hold.run import HoldTester
+from lgrasp.hold.run import course_of
 from lgrasp.judge.meshes import clean_mesh, mass_centre
-from lgrasp.object.arrays import upload_object
 from lgrasp.object.mass import mass_properties
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.simulate.scene import object_of_record
@@ -97,9 +96,7 @@ def test_all_who_weigh_an_object_agree(mesh, fast):
     np.testing.assert_allclose(solid.center, center, atol=1e-6)
     np.testing.assert_allclose(mass_frame(record)[0], center, atol=1e-6)
     np.testing.assert_allclose(mass_centre(clean_mesh(record.vertices, record.faces)), center, atol=1e-6)
-    tester = HoldTester.__new__(HoldTester)
-    tester._object, tester._device = upload_object(model, "cpu"), "cpu"
-    course = tester._make_course()
+    course = course_of(model, "cpu")
     np.testing.assert_allclose(np.asarray(course.com) + model.center, center, atol=1e-6)
     over_mass = solid.inertia / solid.volume
     np.testing.assert_allclose(np.asarray(course.inertia).reshape(3, 3), over_mass, atol=1e-5 * np.trace(over_mass))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lgrasp.choices import ShapeKind
-from lgrasp.object.shapes import random_shape
+from lgrasp.object.shapes import deformed_shape, random_shape
 
 
 @pytest.mark.parametrize("kind", [None, *get_args(ShapeKind)])
@@ -28,3 +28,14 @@ def test_mugs_and_bowls_are_hollow():
         assert mesh.volume < 0.6 * mesh.convex_hull.volume, kind
         middle = mesh.bounds.mean(0) * [0, 1, 0] + [0, 0, mesh.bounds[1, 2] - 1e-3]
         assert not mesh.contains([middle])[0], kind
+
+
+def test_deformed_solids_are_still_solids():
+    for number, kind in enumerate(["box", "can", "mug", "tool"]):
+        mesh = random_shape(0, 0, kind)
+        deformed = [deformed_shape(mesh, np.random.default_rng(seed)) for seed in (number, number, 9)]
+        assert all(one.is_watertight and one.volume > 0 for one in deformed)
+        assert max(one.extents.max() for one in deformed) <= 0.2201
+        assert np.array_equal(deformed[0].vertices, deformed[1].vertices)
+        assert not np.allclose(deformed[0].extents, deformed[2].extents)
+        assert not np.allclose(deformed[0].extents, mesh.extents)

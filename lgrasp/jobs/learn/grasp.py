@@ -1,4 +1,4 @@
-"""Train a one-object predictor on shards: views of objects, a network that completes them, one that draws grasps."""
+"""Train a one-object predictor: a network that completes views on random solids, one that draws grasps on shards."""
 
 import time
 from typing import ClassVar
@@ -20,9 +20,10 @@ from lgrasp.learn.diffuser.features import mesh_centre
 from lgrasp.learn.diffuser.senses import coarse_grid
 from lgrasp.learn.diffuser.training import StepTrainer
 from lgrasp.learn.grasp.completion import CompletionNet
-from lgrasp.learn.grasp.completion_training import ViewSet, fit_completion
+from lgrasp.learn.grasp.completion_training import ViewSet, fit_completion, solid_views
 from lgrasp.learn.grasp.examples import first_steps, grasp_examples
 from lgrasp.learn.grasp.file import KIND, VERSION, Networks, predictor_bytes
+from lgrasp.learn.grasp.solids import random_solids
 from lgrasp.learn.grasp.views import draw_views
 
 _LEAST = 64  # grasps to learn from
@@ -47,8 +48,11 @@ class GraspJob(GraspRequest, NetworkJob):
         completes = CompletionNet(p.channels).to(alias)
         torch.random.set_rng_state(state)
         start = time.perf_counter()
+        solids = random_solids(p.seed, p.shapes, p.cloud, lambda made: progress(0, f"{made:,} solids"))
+        seconds["solids"] = time.perf_counter() - start
+        start = time.perf_counter()
         completion = LossCurve(p.completion_steps, lambda step, loss: progress(step, f"loss {loss:.3f}"))
-        error = fit_completion(completes, views, unseen, p, completion)
+        error = fit_completion(completes, solid_views(solids, alias), p, completion)
         seconds["completion"] = time.perf_counter() - start
         start = time.perf_counter()
         draws = make_net(hand, 1, p)

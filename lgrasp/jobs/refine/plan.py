@@ -16,7 +16,6 @@ from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found, shard_path
 from lgrasp.engine.run import Job
 from lgrasp.errors import LgraspError, StarvedError
-from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader
 from lgrasp.grasp.rows import grasp_rows, press
 from lgrasp.hand.arrays import upload_hand
@@ -34,7 +33,7 @@ from lgrasp.planning.params import PlanParams, cloud_params
 from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import STAND_OFF
 
-VERSION = 8
+VERSION = 9
 """Raised whenever plans change for the same parameters."""
 
 _OBSTACLE_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
@@ -111,7 +110,7 @@ class PlanJob(PlanRequest, Job):
             shard_index=0,
             config={
                 "run_key": self.key(),
-                "bounds": self._bounds().describe(),
+                "bounds": planner.effort.bounds.describe(),
                 "plan": self._params().model_dump(mode="json"),
                 "starts": self.starts,
                 "stand_off": self._stand_off(),
@@ -176,11 +175,6 @@ class PlanJob(PlanRequest, Job):
 
     def _params(self) -> PlanParams:
         return self.params if self.cloud is None else cloud_params(self.params)
-
-    def _bounds(self) -> GraspBounds:
-        """What the plans satisfy."""
-        fingers = None if self.networks() is None else self._models()[1].groups
-        return self._params().effort(fingers).bounds
 
     def _stand_off(self) -> float:
         return self.stand_off or self._models()[0].spec.stand_off or STAND_OFF

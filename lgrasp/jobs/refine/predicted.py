@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface
+from lgrasp.learn.grasp.completion import LIKELY, SHARES
 from lgrasp.learn.grasp.file import Networks
 from lgrasp.learn.grasp.predictor import GraspPredictor
 from lgrasp.object.model import ObjectModel
@@ -28,10 +29,12 @@ def predicted_planner(
         starts: how many there will be at most.
         palmar, around: as of :class:`Planner`.
     """
-    draws = params.effort(hand.model.groups).draws
     predictor = GraspPredictor(hand.model.tree, networks, model.contact_points, model.contact_normals, hand.device)
-    _ = predictor.grid  # both threads need it
+    unsure = predictor.one_sided and not len(model.faces)
+    draws = params.effort(hand.model.groups, unsure).draws
+    _ = predictor.grids  # both threads need them
+    surfaces = range(len(SHARES)) if unsure else [LIKELY]  # the widest first: hands stop outside, fingers close
     with ThreadPoolExecutor(1) as pool:
         drawn = pool.submit(predictor.draw, starts * draws, seed)
-        whole = model if len(model.faces) else predictor.completed(model, params.thicker)
-    return Planner(hand, whole, 0.0, params, palmar, around, Guesses(*drawn.result()))
+        whole, *others = [model] if len(model.faces) else [predictor.completed(model, k) for k in surfaces]
+    return Planner(hand, whole, 0.0, params, palmar, around, Guesses(*drawn.result()), tuple(others))

@@ -11,13 +11,22 @@ from torch.nn import functional
 from lgrasp.object.sdf import SdfGrid
 
 CHANNELS = 5
+SHARES = 0.15, 0.5, 0.85
+"""The object reaches so likely to each of the surfaces that are guessed, from the widest to the narrowest."""
+
+LIKELY = 1
+"""Of these, the one that it is as likely to lie within as beyond."""
+
+ONE_SIDED = 0.35
+"""Length of the mean normal above which a cloud shows one side."""
+
 _MARGIN, _PAD = 1.25, 0.015  # half side of the cube over the cloud's radius, and beyond that [m]
 _NEAR = 4.0  # cells within which signed distances are seen
-_ONE_SIDED = 0.35  # length of the mean normal above which a cloud shows one side
 _RIM = 0.02  # share of the points that lie beyond the rim
 _BLOCK = 1 << 25  # distances at a time
 _AT_ONCE = 16  # clouds
 _DIAGONAL = 3**0.5  # of a cell, over its side
+_APART = -4.0  # surfaces are this far apart before any training, by what softplus makes of it
 
 
 class Cubes(NamedTuple):
@@ -32,8 +41,8 @@ class Cubes(NamedTuple):
     behind the rim."""
 
     def some(self, index: torch.Tensor) -> "Cubes":
-        """Some of them, by index."""
-        return Cubes(*(x[index] for x in self))
+        """Some of them, by index, in single precision."""
+        return Cubes(*(x[index].float() for x in self))
 
 
 def unit_nodes(count: int, device: torch.device) -> torch.Tensor:
@@ -54,7 +63,7 @@ def cubes_of(points: torch.Tensor, normals: torch.Tensor, count: int) -> Cubes:
     for cloud, normal, h in zip(points, normals, half, strict=True):
         away, seen = _distances(nodes * h, cloud, normal)
         base, one_sided = seen, normal.mean(0).norm()
-        if one_sided > _ONE_SIDED:
+        if one_sided > ONE_SIDED:
             flip = torch.tensor([1.0, 1.0, -1.0], device=points.device)
             rim = torch.zeros(3, device=points.device)
             rim[2] = 2 * cloud[:, 2].quantile(_RIM)
@@ -75,7 +84,7 @@ def _distances(x: torch.Tensor, points: torch.Tensor, normals: torch.Tensor) -> 
 
 
 class CompletionNet(nn.Module):
-    """A U-Net on cubes; it corrects their first guess.
+    """A U-Net on cubes; it corrects their first guess, and tells how sure it is.
 
     Args:
         channels: at the finest of four levels.
@@ -88,19 +97,23 @@ class CompletionNet(nn.Module):
             _Block(a, b, stride) for a, b, stride in zip([CHANNELS, *sizes[:-1]], sizes, (1, 2, 2, 2), strict=True)
         )
         self.up = nn.ModuleList(_Block(a + b, a, 1) for a, b in pairwise(sizes))
-        self.out = nn.Conv3d(channels, 1, 1, bias=False)
+        self.out = nn.Conv3d(channels, len(SHARES), 1)
         nn.init.zeros_(self.out.weight)
+        self.out.bias = nn.Parameter(torch.tensor([_APART, 0.0, _APART]))
 
     def forward(self, cubes: Cubes) -> torch.Tensor:
-        """Signed distances of the objects in half sides, (N, n, n, n)."""
+        """Signed distances from the surfaces SHARES in half sides, (N, 3, n, n, n)."""
         seen, x = [], cubes.values
-        for block in self.down:
-            x = block(x)
-            seen.append(x)
-        for block, finer in zip(reversed(self.up), reversed(seen[:-1]), strict=True):
-            x = functional.interpolate(x, size=finer.shape[2:], mode="trilinear", align_corners=False)
-            x = block(torch.cat([finer, x], 1))
-        return self.out(x)[:, 0] + cubes.base
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.training and x.is_cuda):
+            for block in self.down:
+                x = block(x)
+                seen.append(x)
+            for block, finer in zip(reversed(self.up), reversed(seen[:-1]), strict=True):
+                x = functional.interpolate(x, size=finer.shape[2:], mode="trilinear", align_corners=False)
+                x = block(torch.cat([finer, x], 1))
+        wider, guess, narrower = self.out(x.float()).unbind(1)
+        likely = guess + cubes.base
+        return torch.stack([likely - functional.softplus(wider), likely, likely + functional.softplus(narrower)], 1)
 
 
 class _Block(nn.Module):
@@ -115,8 +128,10 @@ class _Block(nn.Module):
 
 
 @torch.no_grad()
-def completed_grids(net: CompletionNet, points: torch.Tensor, normals: torch.Tensor, count: int) -> list[SdfGrid]:
-    """Signed distances of whole objects, guessed from clouds, in the frames of these.
+def completed_grids(
+    net: CompletionNet, points: torch.Tensor, normals: torch.Tensor, count: int
+) -> list[tuple[SdfGrid, ...]]:
+    """Signed distances from the surfaces SHARES of whole objects, guessed from clouds, in the frames of these.
 
     Args:
         points, normals: as of :func:`cubes_of`. count: nodes along a side.
@@ -124,10 +139,13 @@ def completed_grids(net: CompletionNet, points: torch.Tensor, normals: torch.Ten
     grids = []
     for some in torch.arange(len(points), device=points.device).split(_AT_ONCE):
         cubes = cubes_of(points[some], normals[some], count)
-        values = net(cubes) * cubes.half[:, None, None, None]
-        values = without_specks(values, 2 * cubes.half / (count - 1)).cpu().numpy()
-        for h, value in zip(cubes.half.tolist(), values, strict=True):
-            grids.append(SdfGrid(value.astype(np.float32), np.full(3, -h, np.float32), 2 * h / (count - 1)))
+        values = net(cubes) * cubes.half[:, None, None, None, None]
+        cells = 2 * cubes.half / (count - 1)
+        values = without_specks(values.flatten(0, 1), cells.repeat_interleave(len(SHARES)))
+        for h, cell, surfaces in zip(
+            cubes.half.tolist(), cells.tolist(), values.unflatten(0, (-1, len(SHARES))).cpu().numpy(), strict=True
+        ):
+            grids.append(tuple(SdfGrid(x.astype(np.float32), np.full(3, -h, np.float32), cell) for x in surfaces))
     return grids
 
 

@@ -1,14 +1,16 @@
-"""Training of the completing network on views of objects whose distances are known."""
+"""Training of the completing network on views of solids whose distances are known."""
 
 import math
 from collections.abc import Callable, Sequence
 
 import torch
 from torch.nn import functional
+from torch.nn.utils import convert_conv3d_weight_memory_format
 
 from lgrasp.differentiable.distance import DistanceGrids
-from lgrasp.learn.grasp.completion import CompletionNet, Cubes, cubes_of, unit_nodes
+from lgrasp.learn.grasp.completion import SHARES, CompletionNet, Cubes, cubes_of, unit_nodes
 from lgrasp.learn.grasp.params import GraspParams
+from lgrasp.learn.grasp.solids import SeenSolid
 from lgrasp.learn.grasp.views import CloudView
 from lgrasp.object.sdf import SdfGrid
 
@@ -36,32 +38,34 @@ class ViewSet:
         self.each = len(views) // len(grids)
 
     def cubes(self, count: int) -> tuple[Cubes, torch.Tensor]:
-        """What the network is given of all views, and the objects' signed distances in half sides, (N, n, n, n)."""
+        """What the network is given of all views, and the objects' signed distances in half sides, (N, n, n, n); in
+        half precision, as they take much memory."""
         nodes, parts = unit_nodes(count, self.points.device), []
         for some in torch.arange(len(self.points), device=self.points.device).split(_AT_ONCE):
             cubes = cubes_of(self.points[some], self.normals[some], count)
             h = cubes.half[:, None, None]
             at = (nodes * h) @ self.R[some].mT + self.t[some, None]
             goal = self.grids.value(at, (some // self.each)[:, None]) / h[..., 0]
-            parts.append((*cubes, goal.clamp(-_REACH, _REACH).reshape(cubes.base.shape)))
+            found = *cubes, goal.clamp(-_REACH, _REACH).reshape(cubes.base.shape)
+            parts.append([x.half() for x in found])
         half, values, base, goal = (torch.cat(x) for x in zip(*parts, strict=True))
         return Cubes(half, values, base), goal
 
 
-def fit_completion(
-    net: CompletionNet,
-    views: ViewSet,
-    unseen: torch.Tensor,
-    p: GraspParams,
-    told: Callable[[int, float], None] | None,
-) -> float:
-    """Train a network in place on all but unseen objects (O,); the mean loss of the last tenth of the steps.
+def solid_views(solids: Sequence[SeenSolid], device: torch.device | str) -> ViewSet:
+    """All views of some solids."""
+    return ViewSet([view for solid in solids for view in solid.views], [solid.grid for solid in solids], device)
 
-    The loss is the mean error of distances, those near the surface counting most, and how sure the network is of the
-    wrong side of it. Cubes are turned by right angles about z and mirrored at random.
+
+def fit_completion(
+    net: CompletionNet, views: ViewSet, p: GraspParams, told: Callable[[int, float], None] | None
+) -> float:
+    """Train a network in place; the mean loss of the last tenth of the steps.
+
+    Cubes are turned by right angles about z and mirrored at random.
     """
     cubes, goals = views.cubes(p.nodes)
-    rows = (~unseen).repeat_interleave(views.each).nonzero()[:, 0]
+    convert_conv3d_weight_memory_format(net.train(), torch.channels_last_3d)
     optimiser = torch.optim.AdamW(net.parameters(), lr=p.completion_rate, weight_decay=1e-4)
     draw = torch.Generator().manual_seed(p.seed)
     recent: list[torch.Tensor] = []
@@ -69,10 +73,10 @@ def fit_completion(
         fall = 0.5 * (1 + math.cos(math.pi * step / p.completion_steps))
         for group in optimiser.param_groups:
             group["lr"] = p.completion_rate * min(1.0, (step + 1) / _WARM) * fall
-        chosen = rows[torch.randint(len(rows), (p.completion_batch,), generator=draw)].to(goals.device)
+        chosen = torch.randint(len(goals), (p.completion_batch,), generator=draw).to(goals.device)
         turn, mirror = (int(torch.randint(n, (), generator=draw)) for n in (4, 2))
         given = Cubes(*(_turned(x, turn, mirror) for x in cubes.some(chosen)))
-        goal = _turned(goals[chosen], turn, mirror)
+        goal = _turned(goals[chosen].float(), turn, mirror)
         loss = completion_loss(net(given), goal, p.nodes)
         optimiser.zero_grad()
         loss.backward()
@@ -81,16 +85,24 @@ def fit_completion(
         recent.append(loss.detach())
         if told and ((step + 1) % _TOLD == 0 or step + 1 == p.completion_steps):
             told(step + 1, float(torch.stack(recent[-_TOLD:]).mean()))
+    convert_conv3d_weight_memory_format(net.eval(), torch.contiguous_format)
     return float(torch.stack(recent[-max(1, p.completion_steps // 10) :]).mean())
 
 
 def completion_loss(found: torch.Tensor, goal: torch.Tensor, nodes: int) -> torch.Tensor:
-    """Of signed distances found and true, both in half sides, (N, n, n, n)."""
+    """Of signed distances found (N, 3, n, n, n) and true (N, n, n, n), in half sides.
+
+    Errors of distances count most where the surface is guessed, too much or too little by the share of each surface;
+    so does how sure the network is of the wrong side of it.
+    """
+    share = torch.tensor(SHARES, device=goal.device)[:, None, None, None]
+    goal = goal[:, None].expand_as(found)
     far = (goal >= _REACH) & (found >= _REACH)
-    weight = (1 / (_CLOSE + goal.abs())).masked_fill(far, 0.0)
-    cell = 2 / nodes
-    side = functional.binary_cross_entropy_with_logits(-found / cell, (goal < 0).to(goal), weight=weight)
-    return (weight * (found - goal).abs()).mean() + 0.1 * side
+    weight = (1 / (_CLOSE + found.detach().abs())).masked_fill(far, 0.0)
+    error, inside = goal - found, goal < 0
+    pinball = 2 * weight * torch.maximum(share * error, (share - 1) * error)
+    logits, sure = -found * nodes / 2, 2 * weight * torch.where(inside, 1 - share, share)
+    return pinball.mean() + 0.1 * functional.binary_cross_entropy_with_logits(logits, inside.float(), weight=sure)
 
 
 def _turned(x: torch.Tensor, turn: int, mirror: int) -> torch.Tensor:

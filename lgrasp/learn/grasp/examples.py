@@ -5,7 +5,7 @@ import torch
 from lgrasp.hand.tree import Tree
 from lgrasp.learn.diffuser.examples import SequenceSteps, Sights, StepExamples
 from lgrasp.learn.diffuser.network import DiffuserNet
-from lgrasp.learn.grasp.completion import CompletionNet, completed_grids
+from lgrasp.learn.grasp.completion import LIKELY, CompletionNet, completed_grids
 from lgrasp.learn.grasp.completion_training import ViewSet
 from lgrasp.learn.grasp.params import GraspParams
 
@@ -38,6 +38,6 @@ def grasp_examples(
 ) -> StepExamples:
     """Grasps with views of their objects; hands feel the distances of the object as it is completed from a view."""
     device = views.points.device
-    grids = completed_grids(completion, views.points, views.normals, p.nodes)
+    grids = [surfaces[LIKELY] for surfaces in completed_grids(completion, views.points, views.normals, p.nodes)]
     sights = Sights(views.R, views.t)
     return StepExamples(tree, steps, views.points, grids, net, p, device, sights=sights, each=views.each)

@@ -11,7 +11,7 @@ from lgrasp.learn.grasp.completion import CompletionNet
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.networks import network_bytes, open_network
 
-KIND, VERSION = "grasp", 1
+KIND, VERSION = "grasp", 2
 _DRAWS, _COMPLETES = "draws.", "completes."  # weights of which network
 
 

@@ -10,7 +10,7 @@ from lgrasp.geometry.rotations import pose_from_motion
 from lgrasp.grasp.sequences import HeldHands
 from lgrasp.hand.tree import Tree
 from lgrasp.learn.diffuser.sampler import DrawnSteps, StepSampler
-from lgrasp.learn.grasp.completion import completed_grids
+from lgrasp.learn.grasp.completion import LIKELY, ONE_SIDED, completed_grids
 from lgrasp.learn.grasp.file import Networks
 from lgrasp.learn.grasp.views import make_view
 from lgrasp.object.model import ObjectModel
@@ -29,28 +29,37 @@ class CloudCompletion:
         self.view = make_view(points, normals, networks.params.cloud)
 
     @cached_property
-    def grid(self) -> SdfGrid:
-        """Signed distances of the whole object, in the frame of the view."""
+    def grids(self) -> tuple[SdfGrid, ...]:
+        """Signed distances from the surfaces SHARES of the whole object, in the frame of the view."""
         points, normals = (torch.as_tensor(x, device=self._device)[None] for x in (self.view.points, self.view.normals))
         completes, nodes = self._networks.completes.to(self._device), self._networks.params.nodes
         return completed_grids(completes, points, normals, nodes)[0]
 
-    def distance(self, places: np.ndarray) -> np.ndarray:
-        """Guessed signed distances [m] of places (n, 3) in the cloud's frame, (n,); positive beyond what is guessed."""
-        local = (places - self.view.t) @ self.view.R
-        reach = -float(self.grid.origin[0])
-        beyond = np.linalg.norm(np.maximum(np.abs(local) - reach, 0), axis=1)
-        found = sample_sdf(self.grid, local)
+    def distance(self, places: np.ndarray, surface: int = LIKELY) -> np.ndarray:
+        """Guessed signed distances [m] of places (n, 3) in the cloud's frame, (n,); positive beyond what is guessed.
+
+        Args:
+            surface: place in SHARES.
+        """
+        grid, local = self.grids[surface], (places - self.view.t) @ self.view.R
+        beyond = np.linalg.norm(np.maximum(np.abs(local) + float(grid.origin[0]), 0), axis=1)
+        found = sample_sdf(grid, local)
         return np.where(beyond > 0, np.maximum(found, 0) + beyond, found)
 
-    def completed(self, model: ObjectModel, thicker: float = 0.0) -> ObjectModel:
+    @property
+    def one_sided(self) -> bool:
+        """Whether the cloud shows one side."""
+        return float(np.linalg.norm(self.view.normals.mean(0))) > ONE_SIDED
+
+    def completed(self, model: ObjectModel, surface: int = LIKELY) -> ObjectModel:
         """The model of the cloud, whose internal frame is the cloud's frame here, with the sides that nobody saw.
 
         Args:
-            thicker: how far these are moved outward [m].
+            surface: place in SHARES.
         """
-        nodes = np.argwhere(self.grid.values < thicker) * self.grid.cell + self.grid.origin
-        return completed_object(model, lambda x: self.distance(x) - thicker, nodes @ self.view.R.T + self.view.t)
+        grid = self.grids[surface]
+        inside = (np.argwhere(grid.values < 0) * grid.cell + grid.origin) @ self.view.R.T + self.view.t
+        return completed_object(model, lambda x: self.distance(x, surface), inside)
 
 
 class GraspPredictor(CloudCompletion):
@@ -83,4 +92,4 @@ class GraspPredictor(CloudCompletion):
     @cached_property
     def _sampler(self) -> StepSampler:
         draws, process = self._networks.draws, self._networks.params.process
-        return StepSampler(self._tree, draws, process, [self.view.points], [self.grid], self._device)
+        return StepSampler(self._tree, draws, process, [self.view.points], [self.grids[LIKELY]], self._device)

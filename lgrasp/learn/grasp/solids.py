@@ -1,0 +1,60 @@
+"""Views of random solids, from which completing is learnt."""
+
+from collections.abc import Callable
+from typing import NamedTuple, get_args
+
+import numpy as np
+
+from lgrasp.choices import ShapeKind
+from lgrasp.learn.diffuser.features import mesh_centre
+from lgrasp.learn.diffuser.senses import coarse_grid
+from lgrasp.learn.grasp.views import CloudView, draw_views
+from lgrasp.object.sdf import SdfGrid
+from lgrasp.object.shapes import deformed_shape, random_shape
+from lgrasp.runtime.cores import cores
+from lgrasp.runtime.processes import ProcessPool, none_killed
+
+VIEWS = 6
+"""Of each solid."""
+
+_DEFORMED = 0.4  # share of the solids
+_A_PROCESS = 16  # solids at least, which take as long as its start
+
+
+class SeenSolid(NamedTuple):
+    """What is known of one solid."""
+
+    views: list[CloudView]
+    grid: SdfGrid
+
+
+def random_solid(seed: int, number: int, points: int) -> SeenSolid:
+    """Every second one is of a kind of household things, in turn, the others of free forms; most are deformed.
+
+    Args:
+        points: of each view.
+    """
+    rng, kinds = np.random.default_rng([seed, number]), get_args(ShapeKind)
+    mesh = random_shape(seed, number, kinds[number // 2 % len(kinds)] if number % 2 else None)
+    if rng.random() < _DEFORMED:
+        mesh = deformed_shape(mesh, rng)
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    views = draw_views(vertices - mesh_centre(vertices), faces, VIEWS, points, rng)
+    return SeenSolid(views, coarse_grid(vertices, faces, closed=True))
+
+
+def random_solids(
+    seed: int, count: int, points: int, made: Callable[[int], None] = lambda done: None
+) -> list[SeenSolid]:
+    """``count`` of them, by as many processes as there are cores.
+
+    Args:
+        made: called with how many there are.
+    """
+    solids = []
+    with none_killed("makes solids"), ProcessPool(max(1, min(cores(), count // _A_PROCESS))) as pool:
+        waiting = [pool.submit(random_solid, seed, number, points) for number in range(count)]
+        for future in waiting:
+            solids.append(future.result())
+            made(len(solids))
+    return solids
