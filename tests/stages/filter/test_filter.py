@@ -233,7 +233,9 @@ def test_grasps_that_close_from_far_away_are_dropped_where_asked(tables, context
 def test_grasps_that_close_through_the_object_are_dropped_where_asked(tables, context, swift):
     params, bounds = swift.params("filter"), context.bounds
     # no room to open: the way begins in the object
-    shut = replace(context, bounds=bounds.changed(pregrasp_distance=0.0, max_penetration=0.01, allowed_penetration=0.01))
+    shut = replace(
+        context, bounds=bounds.changed(pregrasp_distance=0.0, max_penetration=0.01, allowed_penetration=0.01)
+    )
     free = run(tables.search, params, shut)[0]
     closing = free.metrics["closing_penetration"]
     q = free.q_pregrasp + np.float32(2 / 3) * (free.q - free.q_pregrasp)
