@@ -14,7 +14,7 @@ _FEW_FINGERS = 3
 _DRAWN_ROUNDS = 16  # 20 give no more plans that hold, 12 a few fewer
 _PLAN_BOUNDS = GraspBounds(profile="plan")
 _DRAWN_HOLD = 0.75  # six of eight draws
-_UNSURE_HOLD = 0.375  # three
+_UNSURE_HOLD = 0.375  # three, where few hands hold
 
 
 class Effort(NamedTuple):
@@ -99,8 +99,8 @@ class PlanParams(Params):
         ge=0,
         le=1,
         description="Least share of the draws in which a hand that is tried must hold to be a plan, above 0 also in "
-        "the trial without; default: that of `bounds` if it has one, else 0.75 of those that a network draws for more "
-        "than three fingers, 0.375 if a cloud shows one side, of which several guesses are tried.",
+        "the trial without; default: that of `bounds` if it has one, else 0.75 of those that a network draws, 0.375 "
+        "for three fingers or fewer, or if a cloud shows one side, of which several guesses are tried.",
     )
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
@@ -113,12 +113,12 @@ class PlanParams(Params):
         own: dict[str, Any] = {"draws": 1, "finalists": 10, "tried": 10}
         own["matching_rounds"] = self.search.matching_rounds
         own["min_hold_probability"] = least = self.bounds.min_hold_probability
-        if fingers is not None and fingers <= _FEW_FINGERS:
-            own |= {"draws": 40, "finalists": 24, "tried": 8}
-        elif fingers is not None:
-            own |= {"draws": 24, "finalists": 12, "tried": 8, "matching_rounds": _DRAWN_ROUNDS}
-            own |= {"draws": 40, "finalists": 24, "tried": 16} if unsure else {}
-            own["min_hold_probability"] = least or (_UNSURE_HOLD if unsure else _DRAWN_HOLD)
+        if fingers is not None:
+            few = fingers <= _FEW_FINGERS
+            own |= {"draws": 40, "finalists": 24} if few or unsure else {"draws": 24, "finalists": 12}
+            own |= {"tried": 8} if few or not unsure else {"tried": 16}
+            own |= {} if few else {"matching_rounds": _DRAWN_ROUNDS}
+            own["min_hold_probability"] = least or (_UNSURE_HOLD if few or unsure else _DRAWN_HOLD)
         own |= {name: given for name in own if (given := getattr(self, name)) is not None}
         search = self.search.model_copy(update={"matching_rounds": own.pop("matching_rounds")})
         least = own.pop("min_hold_probability")

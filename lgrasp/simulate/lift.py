@@ -18,7 +18,7 @@ from lgrasp.simulate.model import Model
 from lgrasp.simulate.protocol import FreeLift, Lift, Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.solid import Solid
-from lgrasp.simulate.verdict import CHUNK, Bounds, Look, Verdict, at_rest, moved
+from lgrasp.simulate.verdict import Bounds, Look, Verdict, at_rest, chunk_of, moved
 
 if TYPE_CHECKING:
     from lgrasp.simulate.mujoco_world import MujocoWorld
@@ -180,7 +180,7 @@ def _carry(world: "MujocoWorld | PhysxWorld", model: Model, course: LiftCourse, 
     mass, weight = model.mujoco.body_mass[model.object_body][:, None], model.forces[:, None]
     speed, pushed, settled = np.zeros(3), np.nan, False
     far, counts = np.zeros((len(home), 2)), course.rises if table else 0
-    chunk, total = max(1, round(CHUNK / dt)), len(course.targets)
+    chunk, total = max(1, round(chunk_of(model.protocol) / dt)), len(course.targets)
     for step in range(total):
         if step == course.closes:
             pushed = float(moved(world.objects(), home, model.centers)[:, 0].max())

@@ -22,7 +22,7 @@ from lgrasp.simulate.physx_world import SOLVER, import_physx
 from lgrasp.simulate.protocol import PROTOCOLS, Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.trial import Trial
-from lgrasp.simulate.verdict import CHUNK, Verdict, stack_verdicts
+from lgrasp.simulate.verdict import Verdict, chunk_of, stack_verdicts
 
 _BY_SLOT = ("object_pose", "object_index", "contact_points", "contact_normals", "contact_links", "contact_forces")
 
@@ -280,7 +280,7 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
         simulator=simulator,
         all_directions=all_directions,
         ends_early=True,
-        chunk=CHUNK,
+        chunk=chunk_of(protocol),
         objects=objects,
         **more,
     )

@@ -11,7 +11,19 @@ from lgrasp.simulate.model import Model
 from lgrasp.simulate.mujoco_world import MujocoWorld
 from lgrasp.simulate.shake import shake_course
 from lgrasp.simulate.slip import Frames, points_on_links, slips
-from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude, moved, worst
+from lgrasp.simulate.verdict import (
+    AXES,
+    Bounds,
+    Closed,
+    Look,
+    Pulls,
+    Verdict,
+    at_rest,
+    chunk_of,
+    conclude,
+    moved,
+    worst,
+)
 
 
 class Trial:
@@ -34,7 +46,7 @@ class Trial:
             self._world = PhysxWorld(model)
         self._all, self._settled_stop = all_directions, settled_stop
         self._timestep = model.mujoco.opt.timestep
-        self._chunk = self._steps(CHUNK)
+        self._chunk = self._steps(chunk_of(self._protocol))
         self._bounds = Bounds(model.protocol)
         self.steps = 0
 

@@ -13,6 +13,8 @@ from lgrasp.simulate.protocol import Protocol
 
 CHUNK = 0.05
 """[s] between looks at the objects."""
+LONG_CHUNK = 0.1
+"""The same in PhysX, where objects stand still for longer before they creep, and on the way up [s]."""
 WILD = 1.0e3
 """[m/s or rad/s]: no hand and no object is so fast, the simulation has diverged."""
 AXES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
@@ -133,6 +135,11 @@ class Bounds:
         """
         ahead = now + 4 * np.abs(now - before) * np.asarray(chunks)[..., None, None]
         return (ahead < 0.5 * self.most).all((-2, -1))
+
+
+def chunk_of(protocol: Protocol) -> float:
+    """Time between looks [s]."""
+    return LONG_CHUNK if protocol.engine == "physx" or protocol.lift else CHUNK
 
 
 def conclude(bounds: Bounds, look: Look, closed: Closed, pulls: Pulls, diverged: Any) -> Verdict:
