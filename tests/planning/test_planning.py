@@ -134,10 +134,11 @@ def test_hands_that_hold_less_often_are_drawn_and_tried_more_often_unless_told()
     assert opened.finalists == 10
     rounds = [effort.search.matching_rounds for effort in (opened, few, many)]
     assert rounds[0] == rounds[1] == PlanParams().search.matching_rounds > rounds[2]
-    assert opened.bounds == few.bounds == PlanParams().bounds
+    assert opened.bounds == PlanParams().bounds
     unsure = PlanParams().effort(4, unsure=True)
     assert unsure.draws > many.draws
     assert 0 < unsure.bounds.min_hold_probability < many.bounds.min_hold_probability
+    assert few.bounds == unsure.bounds == PlanParams().effort(3, unsure=True).bounds
     numbers = {"draws": 6, "finalists": 2, "tried": 0}
     told = PlanParams(**numbers, matching_rounds=7, hold=HoldTest(draws=5), min_hold_probability=0.0)
     for effort in (told.effort(fingers) for fingers in (3, 4, None)):
