@@ -13,9 +13,10 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_SPREAD = wp.constant(0.3e-3)  # [m] points so much farther than the deepest belong to the same patch
+_SPREAD = wp.constant(0.15e-3)  # [m] points so much farther than the deepest belong to the same patch
 _APART = wp.constant(1.5e-3)  # [m] least distance of two points of a patch
 _TURN = wp.constant(0.8660254)
+_DEEP = wp.constant(1.0e-3)  # [m] beneath the object's surface, deeper than links press
 _NONE = wp.constant(0x7FFFFFFF)  # beyond all points
 
 
@@ -29,11 +30,10 @@ def _on_both(hand: Hand, obj: Object, b: wp.int32, T: wp.transform, x: wp.vec3):
     s = sdf_gradient(obj.sdf, p)
     n = wp.vec3(s[0], s[1], s[2])
     gap = s[3]
-    at = p - n * gap
     T_body = wp.transform_inverse(T)
     grid = int(-1)
     least = float(1.0e9)
-    local = wp.transform_point(T_body, at)
+    local = wp.transform_point(T_body, p - n * gap)
     for piece in range(hand.pieces.body_first[b], hand.pieces.body_first[b + 1]):
         k = hand.piece_grid[piece]
         if k >= 0 and k != grid:
@@ -43,15 +43,15 @@ def _on_both(hand: Hand, obj: Object, b: wp.int32, T: wp.transform, x: wp.vec3):
                 grid = k
     if grid >= 0 and least < 2.0e-3:
         link = hand_grid(hand.contacts, grid)
-        # to the nearest points of both surfaces, one after the other
+        # to the nearest points of both surfaces, one after the other; the object's lies so deep that they do not meet
         for _it in range(2):
+            local = wp.transform_point(T_body, p - n * (gap + _DEEP))
             m = sdf_gradient(link, local)
-            q = wp.transform_point(T, local - wp.vec3(m[0], m[1], m[2]) * m[3])
-            s = sdf_gradient(obj.sdf, q)
+            p = wp.transform_point(T, local - wp.vec3(m[0], m[1], m[2]) * m[3])
+            s = sdf_gradient(obj.sdf, p)
             n = wp.vec3(s[0], s[1], s[2])
             gap = s[3]
-            at = q - n * gap
-            local = wp.transform_point(T_body, at)
+    at = p - n * gap
     return at, n, gap
 
 

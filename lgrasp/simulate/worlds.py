@@ -21,6 +21,7 @@ _DEEP_PER_OBJECT = 24  # pairs that penetrate, on average
 _CONSTRAINTS_PER_OBJECT = 256  # rows: four a contact, limits, couplings
 _BUFFER_WARNINGS = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # buffers that may be full
 _MOST_ITERATIONS = 20  # of Newton's method: all worlds wait for the slowest
+_TOLERANCE = 1.0e-5  # at which it ends, in single precision
 
 
 @wp.struct
@@ -185,6 +186,7 @@ class Placed(NamedTuple):
                 made.opt.solver = mujoco.mjtSolver.mjSOL_CG
             else:
                 made.opt.iterations = min(made.opt.iterations, _MOST_ITERATIONS)
+                made.opt.tolerance = max(made.opt.tolerance, _TOLERANCE)
                 made.opt.noslip_iterations = 0  # :class:`NoSlip` does it, faster
             made.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # it never resets by itself
         with wp.ScopedDevice(device):

@@ -15,6 +15,12 @@ def two_fingers(tmp_path_factory) -> HandArrays:
 
 
 @pytest.fixture(scope="session")
+def two_known_fingers(tmp_path_factory) -> HandArrays:
+    """The same; distances from their tips are known."""
+    return pointed_hand(tmp_path_factory.mktemp("known"), sliding(2), ["pad", "tip0", "tip1"])
+
+
+@pytest.fixture(scope="session")
 def three_fingers(tmp_path_factory) -> HandArrays:
     """They slide towards the z axis, 120 degrees apart."""
     return pointed_hand(tmp_path_factory.mktemp("three"), sliding(3))

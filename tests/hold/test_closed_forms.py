@@ -29,6 +29,18 @@ def test_a_block_slips_at_mu_n_for_any_friction(two_fingers, box, force):
     assert held == HOLDS
 
 
+@pytest.mark.parametrize("force", [2.0, 10.0])
+def test_a_corner_stays_as_deep_as_it_is_pressed(two_known_fingers, box, force):
+    """Where link and object overlap, distances of both tell how deep it is, for as long as the pull lasts."""
+    held = [
+        HoldTester(two_known_fingers, box, certain(share / (2 * force), torsion=0.002)).run(press([force]), 0)[
+            "hold_probability"
+        ][0]
+        for share in (0.9, 0.97, 1.1, 1.2)
+    ]
+    assert held == HOLDS
+
+
 def test_draws_take_what_the_object_may_be_in_turn(two_fingers, box):
     """A block too narrow for the fingers is not held."""
     test = certain(0.6).model_copy(update={"draws": 4})

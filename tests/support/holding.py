@@ -36,12 +36,16 @@ FINGER = """
   <axis xyz="{axis}"/><limit lower="-0.5" upper="0.5"/></joint>"""
 
 
-def pointed_hand(folder: Path, fingers: Sequence[dict]) -> HandArrays:
-    """The pad, which hand.yaml must name, is far from everything; it is the first joint."""
+def pointed_hand(folder: Path, fingers: Sequence[dict], links: Sequence[str] = ("pad",)) -> HandArrays:
+    """The pad is far from everything; it is the first joint.
+
+    Args:
+        links: that hand.yaml names, of which distances are known; default: the pad alone.
+    """
     path = folder / "hand.urdf"
     body = "".join(FINGER.format(i=i, edge=TIP, **finger) for i, finger in enumerate(fingers))
     path.write_text(f'<robot name="hand">{FAR}{body}</robot>')
-    return upload_hand(build_hand(path, minimal_spec("hand", ["pad"])), "cpu")
+    return upload_hand(build_hand(path, minimal_spec("hand", list(links))), "cpu")
 
 
 def sliding(count: int) -> list[dict]:
