@@ -120,11 +120,17 @@ class Pipeline(_Head):
         if not self.open_to_hands:
             return self
         if "close" in self.order:
-            closes = joints <= self.params("close").joints
-            # contacts in reach tell little of where fingers meet an object as they close
-            return self.without("domain", "ik", "wrap").with_params("place", samples=0) if closes else self.without("close")
+            return self._closing() if joints <= self.params("close").joints else self.without("close")
         adjusts = joints <= self.params("adjust").joints and not self.poses_stay
         return self.without("ik" if adjusts else "adjust")
+
+    def _closing(self) -> "Pipeline":
+        """A copy in which fingers close: contacts in reach tell little of where they will touch, and a contact point of
+        the object must be near by."""
+        points = max(self.object.contact_count, self.params("close").contact_count)
+        dense = self.object.model_copy(update={"contact_count": points})
+        kept = self.without("domain", "ik", "wrap").with_params("place", samples=0)
+        return kept.model_copy(update={"object": dense})
 
     def without(self, *stages: str) -> "Pipeline":
         """A copy that lacks stages; without ik contacts are drawn once."""
