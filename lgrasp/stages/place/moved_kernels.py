@@ -31,11 +31,11 @@ def _surface_near(obj: Object, i: wp.int32, reach: wp.float32, state: wp.uint32)
     chosen = i
     n = float(0.0)
     for k in range(obj.contacts):
-        if wp.length(obj.contact_points[k] - obj.contact_points[i]) < reach:
-            if wp.dot(obj.contact_normals[k], obj.contact_normals[i]) > _SAME_SIDE:
-                n += 1.0
-                if wp.randf(state) * n < 1.0:
-                    chosen = k
+        near = wp.length(obj.contact_points[k] - obj.contact_points[i]) < reach
+        if near and wp.dot(obj.contact_normals[k], obj.contact_normals[i]) > _SAME_SIDE:
+            n += 1.0
+            if wp.randf(state) * n < 1.0:
+                chosen = k
     return chosen
 
 

@@ -155,8 +155,9 @@ def rate_pose(
     is a policy, the logarithm of its chance comes first, and a random number is added.
 
     A pair counts when each contact's inward normal is within 40 degrees of the line to the other, and the line passes
-    the centre of mass within ``max_com_distance``; without ``samples`` a policy is told the object's distances alone. The highest rating of several by a policy is drawn in
-    proportion to a power of the chances. Arguments as of :func:`find_reach`.
+    the centre of mass within ``max_com_distance``. Without ``samples`` a policy goes by the object's distances alone.
+    The highest rating of several by a policy is drawn in proportion to a power of the chances. Arguments as of
+    :func:`find_reach`.
     """
     points = wp.zeros(shape=(MAX_HITS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_HITS,), dtype=wp.vec3)

@@ -18,6 +18,8 @@ from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.jobs.hands import for_hand
+from lgrasp.jobs.learn.examples import make_pose_examples
+from lgrasp.learn.params import PosePolicyParams
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
@@ -148,6 +150,20 @@ def test_poses_move_a_little(power, barrett):
     np.testing.assert_allclose(on_palm, hand.contact_points[after["palm_point"]], atol=1e-5)
     facing = turn.apply(obj.contact_normals[after["palm_surface"]])
     np.testing.assert_allclose(facing, -hand.contact_normals[after["palm_point"]], atol=1e-4)
+
+
+def test_a_policy_learns_and_rates_by_distances_alone(power, barrett):
+    """Its examples are poses as they come, and with it many more of them give grasps."""
+    any_pose = power.with_params("place", policy=None, proposals=1).with_params("close", moves=0)
+    context = shard_context(any_pose, barrett, 0)
+    found = np.unique(run_batch(any_pose, context, 0, 512).grasps.index)
+    params = PosePolicyParams.model_validate({"candidates": 512, "draws": 1})
+    examples = make_pose_examples(any_pose, any_pose, context, np.zeros((2, 3)), params)
+    assert examples.reach_yields.sum() == len(found) > 0
+    assert not examples.reach.share.any()
+    assert examples.reach.distances.std() > 0.001
+    rated = power.with_params("close", moves=0)
+    assert len(run_batch(rated, shard_context(rated, barrett, 0), 0, 512).grasps) > 4 * len(found)
 
 
 def _candidate(rows):
