@@ -38,9 +38,9 @@ class CloseParams(Params):
         "give one.",
     )
     move_distance: float = Field(
-        default=0.008, gt=0, le=0.1, description="How far the palm's contact moves at most, on palm and object."
+        default=0.012, gt=0, le=0.1, description="How far the palm's contact moves at most, on palm and object."
     )
-    move_angle: float = Field(default=15.0, ge=0, le=180, description="How far the object rolls on it at most [deg].")
+    move_angle: float = Field(default=20.0, ge=0, le=180, description="How far the object rolls on it at most [deg].")
     rare: float = Field(
         default=0.1,
         ge=0,
