@@ -86,6 +86,12 @@ class Pipeline(_Head):
         return self.on_table or self.steer.pose is not None or self.steer.approach is not None
 
     @property
+    def moves(self) -> int:
+        """Times that poses which gave grasps are moved and closed again; they would have to stay otherwise."""
+        closes = "close" in self.order and not self.open_to_hands and not self.poses_stay
+        return self.params("close").moves if closes else 0
+
+    @property
     def sections(self) -> tuple[tuple[Stage, BaseModel], ...]:
         """Everything that has parameters and a version: the stages, and ``sequence`` where there is one."""
         stages = tuple((STAGES[name], params) for name, params in self.stages)
@@ -114,10 +120,17 @@ class Pipeline(_Head):
         if not self.open_to_hands:
             return self
         if "close" in self.order:
-            closes = joints <= self.params("close").joints
-            return self.without("domain", "ik", "wrap") if closes else self.without("close")
+            return self._closing() if joints <= self.params("close").joints else self.without("close")
         adjusts = joints <= self.params("adjust").joints and not self.poses_stay
         return self.without("ik" if adjusts else "adjust")
+
+    def _closing(self) -> "Pipeline":
+        """A copy in which fingers close: contacts in reach tell little of where they will touch, and a contact point of
+        the object must be near by."""
+        points = max(self.object.contact_count, self.params("close").contact_count)
+        dense = self.object.model_copy(update={"contact_count": points})
+        kept = self.without("domain", "ik", "wrap").with_params("place", samples=0)
+        return kept.model_copy(update={"object": dense})
 
     def without(self, *stages: str) -> "Pipeline":
         """A copy that lacks stages; without ik contacts are drawn once."""

@@ -58,7 +58,7 @@ def make_pose_examples(
     of the others.
 
     Args:
-        realising: by whose stage ik contacts are realised for the second network.
+        realising: by whose stage ik contacts are realised for the second network, unless the pipeline has stage close.
         points: of the policy, (M, 3) base frame [m].
     """
     most = _GPU_BATCH if context.device.startswith("cuda") else _CPU_BATCH
@@ -82,11 +82,13 @@ def _batch(
     poses = run_stage("place", (first, count), pipeline, context, meter)
     index = to_numpy(poses.index)[: len(poses)]
     table: Any = poses
-    once = realising.with_params("domain", rounds=1)
-    for stage in ("domain", "ik"):
+    closes = "close" in pipeline.order
+    once = pipeline if closes else realising.with_params("domain", rounds=1)
+    for stage in ("close",) if closes else ("domain", "ik"):
         table = run_stage(stage, table, once, context, meter)
     early = select_poses(table, np.arange(len(index)), context.device)  # later rounds write where the first did
-    order, found, last = pipeline.order, poses, "place"
+    order = pipeline.order
+    found, last = (table, "close") if closes else (poses, "place")
     if pipeline.realised and "ik" in order:
         for number in range(1, pipeline.params("domain").rounds):
             for stage in ("domain", "ik"):

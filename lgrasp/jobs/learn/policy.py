@@ -58,7 +58,7 @@ class PolicyJob(PolicyRequest, FileJob):
         return self._keys
 
     def key(self) -> str:
-        params = self.pipeline.object
+        params = self.learned.object
         objects = [object_key(name, self.scale, params)[1] for name in self.objects]
         made = {"pipeline": self.learned.describe(), "params": self.params.model_dump(mode="json"), "objects": objects}
         return content_key("policy", _VERSION, hand=self.keys.hand, field=self.keys.field, **made)
@@ -139,7 +139,7 @@ class PolicyJob(PolicyRequest, FileJob):
         return make_pose_examples(learned, self.pipeline.without("adjust", "close"), context, points, p)
 
     def _object(self, number: int) -> ObjectModel:
-        params, alias = self.pipeline.object, self.device_used.alias
+        params, alias = self.learned.object, self.device_used.alias
         if self.objects:
             path, key = object_key(self.objects[number], self.scale, params)
             return Loader(self.cache, alias).object(path, key, self.scale, params)

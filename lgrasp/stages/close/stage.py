@@ -16,25 +16,32 @@ from lgrasp.stages.close.kernels import CloseCount, CloseValues, close_fingers
 from lgrasp.stages.close.params import CloseParams
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.stage import allowed_runs
+from lgrasp.stages.place.moved import move_poses
 from lgrasp.stages.wrap.params import WrapParams
 from lgrasp.stages.wrap.stage import wrap_values
 
-VERSION = 1
+VERSION = 2
+
+_REACH = 0.01  # [m] of links from the object where a finger meets it: others are not those that meet it
 
 
 def run(inputs: PoseTable, params: CloseParams, context: Context) -> tuple[CandidateTable, Tally]:
     """Close each finger, wide open at first, until it touches the object.
 
     A finger of one joint can make one contact where an object is, and few of those that are drawn on its surface.
+    In later passes the poses are moved first.
 
     Returns:
         One realised contact at most of each finger, and counts ``tried``, ``touching``.
     """
+    if context.salt:
+        inputs = move_poses(inputs, params.move_distance, params.move_angle, context)
     d, n, groups = context.device, inputs.index.shape[0], context.hand.model.groups
     tally = empty_tally(CloseCount, d)
     none = wp.empty((0, 0, 0), dtype=vec_further, device=d)
     table = CandidateTable.empty(d, n, groups, 1, poses=replace(inputs, setting=wp.clone(inputs.setting)), further=none)
-    values = wrap_values(WrapParams(**params.model_dump(include={*WrapParams.model_fields})), context.bounds)
+    shared = params.model_dump(include={*WrapParams.model_fields})
+    values = wrap_values(WrapParams(**shared, reach=_REACH), context.bounds)
     runs = allowed_runs(context)
     closing = make_struct(CloseValues, params, context.bounds, record=_records(runs, context))
     asked = [context.hand.struct, context.object.struct, runs, values, closing]

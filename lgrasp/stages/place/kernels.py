@@ -215,7 +215,7 @@ def propose_poses(
         above = params.min_table_distance
         if body_height(hand.pieces, 0, wp.transform_identity(), plane, above) < above:
             rating = Rating.BLOCKED
-        if rating == Rating.CLEAR and params.samples > 0:
+        if rating == Rating.CLEAR and (params.samples > 0 or policy.rows.shape[0] > 0):
             numbers = wp.rand_init(wp.randi(state))
             rating = rate_pose(hand, field, obj, params, policy, steer.groups, T, plane, setting, palm, anchor, numbers)
     proposals_out.pose[row, b] = T

@@ -30,7 +30,10 @@ class PlaceParams(Params):
         default=8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays."
     )
     samples: int = Field(
-        default=24, ge=0, le=256, description="Surface points per finger that rate a pose; 0: no rating."
+        default=24,
+        ge=0,
+        le=256,
+        description="Surface points per finger that rate a pose; 0: none, a policy rates by the object's distances.",
     )
     max_com_distance: float = Field(
         default=NO_BOUND,

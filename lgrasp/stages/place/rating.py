@@ -155,8 +155,9 @@ def rate_pose(
     is a policy, the logarithm of its chance comes first, and a random number is added.
 
     A pair counts when each contact's inward normal is within 40 degrees of the line to the other, and the line passes
-    the centre of mass within ``max_com_distance``. The highest rating of several by a policy is drawn in
-    proportion to a power of the chances. Arguments as of :func:`find_reach`.
+    the centre of mass within ``max_com_distance``. Without ``samples`` a policy goes by the object's distances alone.
+    The highest rating of several by a policy is drawn in proportion to a power of the chances. Arguments as of
+    :func:`find_reach`.
     """
     points = wp.zeros(shape=(MAX_HITS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_HITS,), dtype=wp.vec3)
@@ -185,7 +186,7 @@ def rate_pose(
         owner[m] = -1
         m += 1
     pairs = _opposed_pairs(points, normals, owner, m, wp.transform_point(T, obj.com), params.max_com_distance)
-    if net.rows.shape[0] == 0 or pairs == 0:
+    if net.rows.shape[0] == 0 or (pairs == 0 and params.samples > 0):
         return pairs
     luck = wp.clamp(wp.randf(wp.rand_init(wp.randi(state))), _LEAST_LUCK, 1.0 - _LEAST_LUCK)
     chance = -wp.log(1.0 + wp.exp(-chance_of(net, obj, T, points, normals, share, owner, found, palm)))

@@ -15,7 +15,7 @@ from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.predicted_kernels import propose_predicted
 from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses
 
-VERSION = 8
+VERSION = 9
 
 
 def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:
