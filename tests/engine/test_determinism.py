@@ -30,7 +30,7 @@ def source(pipeline, load):
 
 @pytest.fixture(scope="module")
 def rows(pipeline):
-    return 400 if pipeline.name == "swift" else 12
+    return 200 if pipeline.name == "swift" else 8
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +43,15 @@ def test_batch_size_and_workers(pipeline, source, reference, rows, workers, batc
     assert_same(reference, grasp_arrays(make_shard(pipeline, source, 0, rows, Execution(workers, batch)).grasps))
 
 
+@pytest.fixture(scope="module")
+def sixty(swift, inputs):
+    return make_shard(swift, inputs, 0, 60, Execution(1, 512)).grasps
+
+
 @pytest.mark.parametrize("rate", [1e-2, 1.0, 1e6])
-def test_expected_rows_per_candidate(swift, inputs, monkeypatch, rate):
+def test_expected_rows_per_candidate(swift, inputs, sixty, monkeypatch, rate):
     """Batches sized by the yield, as on a GPU."""
-    expected = grasp_arrays(make_shard(swift, inputs, 0, 60, Execution(1, 512)).grasps)
+    expected = grasp_arrays(sixty)
     size, sizes = shard_module._batch_size, []
 
     def as_on_a_gpu(device, missing, rate, running, most, **_):
@@ -110,12 +115,11 @@ def test_several_passes(swift, inputs, batch):
     assert_same(grasp_arrays(first), grasp_arrays(make_shard(pipeline, inputs, 0, 80, Execution(2, batch)).grasps))
 
 
-def test_seeds_and_shards_differ(swift, inputs):
-    base = make_shard(swift, inputs, 0, 60, Execution()).grasps
+def test_seeds_and_shards_differ(swift, inputs, sixty):
     seed = make_shard(swift.model_copy(update={"seed": 1}), inputs, 0, 60, Execution()).grasps
     shard = make_shard(swift, inputs, 1, 60, Execution()).grasps
     for other in (seed, shard):
-        assert not (base.pose[:, None] == other.pose[None]).all(2).any()
+        assert not (sixty.pose[:, None] == other.pose[None]).all(2).any()
 
 
 def test_shards_do_not_depend_on_their_number(run, grasps, tmp_path):

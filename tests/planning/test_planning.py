@@ -9,11 +9,10 @@ import pytest
 from lgrasp.cloud.model import cloud_object
 from lgrasp.grasp.check import check_grasps, compare_grasps, known_contacts
 from lgrasp.grasp.outcomes import FAILED_BOUNDS, NOT_HELD, REASONS, Outcome
-from lgrasp.grasp.tables import GraspTable
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.planning.params import PlanParams
-from lgrasp.planning.planner import Planner
+from lgrasp.planning.planner import Planned, Planner
 from lgrasp.refine.params import LocalSearch
 
 QUICK = PlanParams(
@@ -85,14 +84,14 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
 
 
 @pytest.fixture(scope="module")
-def plan(inputs) -> Callable[..., GraspTable]:
-    """plan(tried, draws): plans of 60 starts, of fewer none may differ."""
+def plan(inputs) -> Callable[..., Planned]:
+    """plan(tried, draws): what is planned of 60 starts, of fewer none may differ."""
 
     @cache
-    def plan(tried: int, draws: int = 0) -> GraspTable:
+    def plan(tried: int, draws: int = 0) -> Planned:
         several = {"rolls": 12, "finalists": 12, "tried": tried, "hold": HoldTest(draws=draws)}
         params = QUICK.model_copy(update=several)
-        return Planner(inputs.hand, inputs.object.model, 0.12, params).run(60).grasps
+        return Planner(inputs.hand, inputs.object.model, 0.12, params).run(60)
 
     return plan
 
@@ -106,8 +105,8 @@ def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, plan, dr
         share = (found["hold_success"] + draws * found["hold_probability"]) / (1 + draws)
         return dict(zip(table.index.tolist(), share.tolist(), strict=True))
 
-    plans, first = plan(12, draws), plan(0)  # without a try, draws say nothing
-    tried, untried, alone = shares(plans), shares(first), shares(plan(1, draws))
+    plans, first = plan(12, draws).grasps, plan(0).grasps  # without a try, draws say nothing
+    tried, untried, alone = shares(plans), shares(first), shares(plan(1, draws).grasps)
     assert tried.keys() == untried.keys()
     assert all(tried[start] >= share for start, share in untried.items())
     assert sum(tried.values()) > sum(untried.values())
@@ -150,11 +149,11 @@ def test_hands_that_hold_less_often_are_drawn_and_tried_more_often_unless_told()
     assert told.effort(4).bounds == told.bounds
 
 
-def test_hands_that_do_not_hold_as_often_as_is_asked_are_no_plans(inputs):
+def test_hands_that_do_not_hold_as_often_as_is_asked_are_no_plans(inputs, plan):
     """Of each start the best stays a plan if it holds so often, else it is counted; none may be another."""
     params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": 12, "hold": HoldTest(draws=4)})
     strict = params.model_copy(update={"min_hold_probability": 0.75})
-    free = Planner(inputs.hand, inputs.object.model, 0.12, params).run(60)
+    free = plan(12, 4)
     planner = Planner(inputs.hand, inputs.object.model, 0.12, strict)
     asked = planner.run(60)
     assert 0 < asked.counts[NOT_HELD] == free.counts["kept"] - asked.counts["kept"] < free.counts["kept"]

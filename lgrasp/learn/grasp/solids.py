@@ -46,13 +46,18 @@ def random_solid(seed: int, number: int, points: int) -> SeenSolid:
 def random_solids(
     seed: int, count: int, points: int, made: Callable[[int], None] = lambda done: None
 ) -> list[SeenSolid]:
-    """``count`` of them, by as many processes as there are cores.
+    """``count`` of them, by as many processes as there are cores; few are made here.
 
     Args:
         made: called with how many there are.
     """
-    solids = []
-    with none_killed("makes solids"), ProcessPool(max(1, min(cores(), count // _A_PROCESS))) as pool:
+    solids: list[SeenSolid] = []
+    if count < _A_PROCESS:
+        for number in range(count):
+            solids.append(random_solid(seed, number, points))
+            made(len(solids))
+        return solids
+    with none_killed("makes solids"), ProcessPool(min(cores(), count // _A_PROCESS)) as pool:
         waiting = [pool.submit(random_solid, seed, number, points) for number in range(count)]
         for future in waiting:
             solids.append(future.result())

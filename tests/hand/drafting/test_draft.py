@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from support.places import ROOT
-from support.urdfs import fingers, gripper, turned
+from support.urdfs import fingers, gripper
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
@@ -35,11 +35,6 @@ def placed_normals(model: HandModel, q: np.ndarray, group: int) -> np.ndarray:
     return np.einsum("nij,nj->ni", R, model.contact_normals[rows])
 
 
-@pytest.fixture(scope="module")
-def allegro():
-    return draft_spec(ALLEGRO, "drafted")
-
-
 def test_known_hand_is_drafted_like_its_author_did(allegro):
     spec, said = allegro
     author = load_spec(ALLEGRO.parent / "hand.yaml")
@@ -62,14 +57,11 @@ def test_open_posture_is_free_and_inside_the_limits(allegro):
     assert not sample_bodies(model, q[None]).touching[0]
 
 
-@pytest.mark.parametrize(("rpy", "mirror"), [("1.1 -0.7 2.3", False), ("0 0 0", True)], ids=["turned", "left"])
-def test_other_base_and_left_hand(allegro, tmp_path, rpy, mirror):
-    spec, _ = draft_spec(turned(ALLEGRO, tmp_path, rpy, mirror=mirror), "turned")
-    assert spec.base_link == "mount"
-    assert contact_links(spec) == contact_links(allegro[0])
-    assert spec.palm.links == allegro[0].palm.links
-    sign = -1 if mirror else 1
-    assert np.allclose(spec.palm.allowed[0].axis, [sign * x for x in allegro[0].palm.allowed[0].axis], atol=0.05)
+def test_left_hand_on_another_base(allegro, left):
+    assert left.base_link == "mount"
+    assert contact_links(left) == contact_links(allegro[0])
+    assert left.palm.links == allegro[0].palm.links
+    assert np.allclose(left.palm.allowed[0].axis, [-x for x in allegro[0].palm.allowed[0].axis], atol=0.05)
 
 
 def test_prismatic_jaws_face_each_other(tmp_path):
@@ -141,10 +133,10 @@ def test_mesh_in_millimetres_is_refused_by_its_own_name(tmp_path):
 
 
 def test_huge_mesh_is_thinned_and_keeps_its_shape(tmp_path):
-    ball = trimesh.creation.icosphere(subdivisions=7, radius=0.012)
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.012)
     ball.export(tmp_path / "tip.stl")
     made = import_urdf(fingers(tmp_path, 2, '<geometry><mesh filename="tip.stl"/></geometry>'), out=tmp_path / "made")
-    assert any("tip.stl has 327,680 faces: thinned to" in line for line in made.decisions)
+    assert any("tip.stl has 81,920 faces: thinned to" in line for line in made.decisions)
     thin = trimesh.load_mesh(made.folder / "meshes" / "collision" / "tip.stl")
     assert len(thin.faces) <= 40_000
     assert np.abs(np.linalg.norm(thin.vertices, axis=1) - 0.012).max() < 5e-5

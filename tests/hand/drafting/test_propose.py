@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.hands import REAL
 from support.places import ROOT
-from support.urdfs import fingers, gripper, turned
+from support.urdfs import fingers, gripper
 
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.import_urdf import import_urdf
@@ -20,12 +20,6 @@ from lgrasp.hand.urdf import read_urdf
 ALLEGRO = ROOT / "hands" / "allegro" / "hand.urdf"
 # its URDF does not say which finger is which
 NAMES = {"finger_1": "index", "finger_2": "middle", "finger_3": "ring", "finger_4": "thumb"}
-
-
-@pytest.fixture(scope="module")
-def allegro() -> tuple[HandSpec, list[str]]:
-    """Drafted from the primitive URDF."""
-    return draft_spec(ALLEGRO, "drafted")
 
 
 def surfaces(space: OppositionSpace) -> set[frozenset]:
@@ -59,12 +53,11 @@ def test_allegro_is_proposed_the_spaces_of_its_author(allegro, real):
     assert any("opposition spaces" in line and "mm" in line for line in said)
 
 
-def test_a_left_hand_gets_the_mirror_image(allegro, tmp_path):
-    right = allegro[0].opposition_spaces
-    left = draft_spec(turned(ALLEGRO, tmp_path, "0 0 0", mirror=True), "drafted")[0].opposition_spaces
-    assert list(left) == list(right)
+def test_a_left_hand_gets_the_mirror_image(allegro, left):
+    right, mirrored_spaces = allegro[0].opposition_spaces, left.opposition_spaces
+    assert list(mirrored_spaces) == list(right)
     for name, space in right.items():
-        for side, other in zip(space.sides, left[name].sides, strict=True):
+        for side, other in zip(space.sides, mirrored_spaces[name].sides, strict=True):
             # x to -x: palmar surface looks the other way, lateral surface does not
             mirrored = [(part.links, (-part.axis[0] + 0.0, *part.axis[1:])) for part in side]
             assert [(part.links, part.axis) for part in other] == mirrored, name
