@@ -107,9 +107,9 @@ def run_batch(
     """Grasps of candidates ``first .. first + count - 1`` of a shard's stream.
 
     A pure function of its arguments, and of the batch alone: cutting the stream into other batches gives the same rows
-    in the same order. With several passes the poses that yielded are searched again, or moved and closed again, in
-    every block of PASS_BLOCK candidates after one another and the best-yielding first; batches are then whole blocks.
-    Rows of pass p have ``p << PASS_SHIFT`` added to the number of their candidate.
+    in the same order. With several passes the poses that yielded are searched again, in every block of PASS_BLOCK
+    candidates after one another and the best-yielding first; batches are then whole blocks. Rows of pass p have
+    ``p << PASS_SHIFT`` added to the number of their candidate.
 
     Args:
         search: runs the stages up to search, such as :meth:`GraphCache.run`; None launches them one by one.
@@ -120,15 +120,10 @@ def run_batch(
         meter = Meter(context.device)
         sets = run_stages(pipeline, context, first, count, "search", meter)
     grasps = _run_through(pipeline.order[pipeline.order.index("search") + 1 :], sets, pipeline, context, meter)
-    passes, start = pipeline.params("search").passes, "search"
-    table: Any = None
+    passes = pipeline.params("search").passes
     if passes > 1:
         table = _yielding(sets.candidates, grasps, context.device)
-    elif pipeline.moves:
-        passes, start = 1 + pipeline.moves, "close"
-        table = _yielding(sets.candidates, _rare(grasps, pipeline.params("close").rare), context.device).poses
-    if table is not None and len(table):
-        again = pipeline.order[pipeline.order.index(start) :]
+        again = pipeline.order[pipeline.order.index("search") :]
         parts = [grasps]
         for salt in range(1, passes):
             found = _run_through(again, table, pipeline, context.with_salt(salt), meter)
@@ -148,13 +143,6 @@ def _yielding(table: CandidateTable, grasps: GraspTable, device: str) -> Candida
     index, number = np.unique(grasps.index, return_counts=True)
     row = np.searchsorted(to_numpy(table.poses.index)[: len(table.poses)], index)
     return select_poses(table, row[np.lexsort((-number, index // PASS_BLOCK))], device)
-
-
-def _rare(grasps: GraspTable, share: float) -> GraspTable:
-    """Those of blocks in which at most a share of the candidates gave grasps."""
-    block, yielding = np.unique(np.unique(grasps.index) // PASS_BLOCK, return_counts=True)
-    few = block[yielding <= share * PASS_BLOCK]
-    return take_rows(grasps, np.flatnonzero(np.isin(grasps.index // PASS_BLOCK, few)))
 
 
 def _by_blocks(grasps: GraspTable) -> GraspTable:

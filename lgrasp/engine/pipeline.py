@@ -86,12 +86,6 @@ class Pipeline(_Head):
         return self.on_table or self.steer.pose is not None or self.steer.approach is not None
 
     @property
-    def moves(self) -> int:
-        """Times that poses which gave grasps are moved and closed again; they would have to stay otherwise."""
-        closes = "close" in self.order and not self.open_to_hands and not self.poses_stay
-        return self.params("close").moves if closes else 0
-
-    @property
     def sections(self) -> tuple[tuple[Stage, BaseModel], ...]:
         """Everything that has parameters and a version: the stages, and ``sequence`` where there is one."""
         stages = tuple((STAGES[name], params) for name, params in self.stages)

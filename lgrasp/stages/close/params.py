@@ -30,20 +30,3 @@ class CloseParams(Params):
     contact_count: int = Field(
         default=8192, ge=64, le=65536, description="Contact points of objects, at least (object.contact_count)."
     )
-    moves: int = Field(
-        default=24,
-        ge=0,
-        le=255,
-        description="Times that a pose which gave a grasp is moved a little, and fingers close again, where few poses "
-        "give one.",
-    )
-    move_distance: float = Field(
-        default=0.012, gt=0, le=0.1, description="How far the palm's contact moves at most, on palm and object."
-    )
-    move_angle: float = Field(default=20.0, ge=0, le=180, description="How far the object rolls on it at most [deg].")
-    rare: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="Poses are moved where at most this share of 64 candidates in a row gave grasps.",
-    )

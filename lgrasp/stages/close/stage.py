@@ -16,7 +16,6 @@ from lgrasp.stages.close.kernels import CloseCount, CloseValues, close_fingers
 from lgrasp.stages.close.params import CloseParams
 from lgrasp.stages.context import Context
 from lgrasp.stages.filter.stage import allowed_runs
-from lgrasp.stages.place.moved import move_poses
 from lgrasp.stages.wrap.params import WrapParams
 from lgrasp.stages.wrap.stage import wrap_values
 
@@ -29,13 +28,10 @@ def run(inputs: PoseTable, params: CloseParams, context: Context) -> tuple[Candi
     """Close each finger, wide open at first, until it touches the object.
 
     A finger of one joint can make one contact where an object is, and few of those that are drawn on its surface.
-    In later passes the poses are moved first.
 
     Returns:
         One realised contact at most of each finger, and counts ``tried``, ``touching``.
     """
-    if context.salt:
-        inputs = move_poses(inputs, params.move_distance, params.move_angle, context)
     d, n, groups = context.device, inputs.index.shape[0], context.hand.model.groups
     tally = empty_tally(CloseCount, d)
     none = wp.empty((0, 0, 0), dtype=vec_further, device=d)
