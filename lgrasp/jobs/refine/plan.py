@@ -33,7 +33,7 @@ from lgrasp.planning.params import PlanParams, cloud_params
 from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import STAND_OFF
 
-VERSION = 9
+VERSION = 10
 """Raised whenever plans change for the same parameters."""
 
 _OBSTACLE_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
