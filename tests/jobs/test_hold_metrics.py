@@ -70,7 +70,7 @@ def test_they_are_those_of_the_stage(tried, add, tmp_path):
     assert found.metric_units["hold_drift"] == "m"
     assert {0, 1} == set(found.metrics["hold_success"])
     same = np.all([found.metrics[n] == whole.grasps.metrics[n] for n in METRICS[:2]], axis=0)
-    assert same.mean() > 0.95  # poses in files are rounded
+    assert same.mean() > 0.9  # poses in files are rounded
     held = same & (found.metrics["hold_success"] > 0)
     drift = [rows.metrics["hold_drift"][held] for rows in (found, whole.grasps)]
     assert (np.abs(drift[0] - drift[1]) < 1e-4).mean() > 0.9
