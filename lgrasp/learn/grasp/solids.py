@@ -1,6 +1,7 @@
 """Views of random solids, from which completing is learnt."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -52,14 +53,16 @@ def random_solids(
         made: called with how many there are.
     """
     solids: list[SeenSolid] = []
-    if count < _A_PROCESS:
-        for number in range(count):
-            solids.append(random_solid(seed, number, points))
+
+    def keep(found: Iterable[SeenSolid]) -> list[SeenSolid]:
+        for solid in found:
+            solids.append(solid)
             made(len(solids))
         return solids
+
+    make = partial(random_solid, seed, points=points)
+    if count < _A_PROCESS:
+        return keep(make(number) for number in range(count))
     with none_killed("makes solids"), ProcessPool(min(cores(), count // _A_PROCESS)) as pool:
-        waiting = [pool.submit(random_solid, seed, number, points) for number in range(count)]
-        for future in waiting:
-            solids.append(future.result())
-            made(len(solids))
-    return solids
+        waiting = [pool.submit(make, number) for number in range(count)]
+        return keep(future.result() for future in waiting)

@@ -12,7 +12,7 @@ from lgrasp.math.kinematics import group_forward, point_column, vec_dof
 from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.wrap.kernels import nearest_probe
+from lgrasp.stages.wrap.kernels import near_links
 from lgrasp.stages.wrap.touch import LinkTouch, WrapValues, contact_beside, fits, nearest_touch
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -123,14 +123,7 @@ def _touching(
         if not _meets(hand, obj, g, q + way * (t + size), way, T_object, X):
             t += size
     j0 = group_forward(hand.kin, g, q + way * t, X, 0)
-    n = int(0)
-    for r in range(runs.body.shape[0]):
-        body = runs.body[r]
-        if hand.body_group[body] == g and runs.grid[r] >= 0 and n < _LINKS:
-            near = nearest_probe(hand, obj, runs, params, r, T_object * X[body - 1 - j0])
-            if near.run >= 0:
-                touch[n] = near
-                n += 1
+    n = near_links(hand, obj, runs, params, g, T_object, X, touch)
     for _it in range(wp.where(n == 0, 0, params.iterations + 1)):
         first = int(0)
         for i in range(n):

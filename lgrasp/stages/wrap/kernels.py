@@ -39,7 +39,7 @@ class WrapCount(IntEnum):
 
 
 @wp.func
-def nearest_probe(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues, r: wp.int32, T: wp.transform):
+def _nearest_probe(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues, r: wp.int32, T: wp.transform):
     """The point of a run that is nearest to the object and faces it, as a touch; its run is -1 if none is in reach.
 
     T = T_object_body.
@@ -60,6 +60,32 @@ def nearest_probe(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues,
                 touch.local = runs.points[k]
                 touch.out = runs.normals[k]
     return touch
+
+
+@wp.func
+def near_links(
+    hand: Hand,
+    obj: Object,
+    runs: PalmarRuns,
+    params: WrapValues,
+    g: wp.int32,
+    T_object: wp.transform,
+    X: wp.array(dtype=wp.transform),
+    touch: wp.array(dtype=LinkTouch),
+):
+    """Number of links of a finger that have a point in reach; writes its touch for each, as many as there is room for.
+
+    X: its bodies, T_object = T_object_base.
+    """
+    n = int(0)
+    for r in range(runs.body.shape[0]):
+        body = runs.body[r]
+        if hand.body_group[body] == g and runs.grid[r] >= 0 and n < touch.shape[0]:
+            near = _nearest_probe(hand, obj, runs, params, r, T_object * X[body - 1 - hand.kin.joint_first[g]])
+            if near.run >= 0:
+                touch[n] = near
+                n += 1
+    return n
 
 
 @wp.func
@@ -289,19 +315,13 @@ def _wrapping(size: int) -> Any:
         task = wp.zeros(shape=(_LINKS,), dtype=wp.int32)
         posture = candidates_out.q[row, g, m]
         group_forward(hand.kin, g, posture, X, 0)
-        n = int(0)
+        n = near_links(hand, obj, runs, params, g, T_object, X, touch)
         first = int(-1)
-        for r in range(runs.body.shape[0]):
-            body = runs.body[r]
-            if hand.body_group[body] == g and runs.grid[r] >= 0 and n < _LINKS:
-                near = nearest_probe(hand, obj, runs, params, r, T_object * X[body - 1 - j0])
-                if near.run >= 0:
-                    touch[n] = near
-                    task[n] = _WAITING
-                    if runs.link[r] == own:
-                        first = n
-                        task[n] = _ASKED
-                    n += 1
+        for i in range(n):
+            task[i] = _WAITING
+            if runs.link[touch[i].run] == own:
+                first = i
+                task[i] = _ASKED
         made = int(0)
         for _round in range(wp.where(first < 0, 0, params.rounds)):
             group_forward(hand.kin, g, posture, X, 0)
