@@ -249,7 +249,8 @@ def _figures(report: dict[str, Any]) -> str:
 
 def _learnt_from(report: dict[str, Any]) -> str:
     objects, params = report.get("objects", []), report.get("params", {})
-    named = objects if isinstance(objects, str) else plural(len(objects), "object")
+    names = objects.split(", ") if isinstance(objects, str) else objects
+    named = objects if isinstance(objects, str) and len(names) == 1 else plural(len(names), "object")
     held_out = report.get("unseen", [])
     more = [f"{plural(len(held_out), 'object')} held out"] if held_out else []
     more += [f"{report['examples']:,} examples"] if "examples" in report else []

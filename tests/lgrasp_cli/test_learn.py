@@ -136,7 +136,9 @@ def test_networks_are_known_by_name(generate, cli, monkeypatch, tmp_path):
     assert found["toy"]["bytes"] == len(data)
     assert found["bad"]["kind"].startswith("cannot be used: ")
     assert found["hand"]["kind"].startswith("pose")  # shipped with hands
-    (line,) = (line for line in cli("learn", "list").out.splitlines() if line.startswith("toy"))
+    lines = cli("learn", "list").out.splitlines()
+    assert any("130 objects" in line for line in lines if line.startswith("hand"))  # by their names in the card
+    (line,) = (line for line in lines if line.startswith("toy"))
     assert line.split("  ")[-1].strip() == "loss 0.25"
     assert "2 objects, 1 object held out, 1,200 examples, seed 3" in line
     assert generate(rows=3).code == 0
