@@ -283,96 +283,102 @@ def _next(queue: wp.array(dtype=wp.int32), w: Scratch):
     return lanes_least(number)
 
 
+@wp.func
+def _begin(course: Course, spread: Spread, grasps: TriedGrasps, trials: Trials, i: wp.int32, hand: Hand, w: Scratch):
+    """Draw the numbers of trial i; returns it with the open hand about the object at rest."""
+    row = trials.row[i]
+    rng = wp.rand_init(spread.seed, grasps.number[row])
+    u = vec_numbers()
+    for k in range(DRAWN_NUMBERS):
+        u[k] = _share(rng, spread, trials.draw[i], k)
+    m = Material()
+    m.friction = _between(spread.friction, u[0])
+    m.torsion = _between(spread.torsion, u[1])
+    mass = _between(spread.mass, u[2])
+    m.drive = _between(spread.stiffness, u[3])
+    m.drag = _between(spread.damping_ratio, u[4]) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
+    logarithms = wp.vec2(wp.log(spread.contact_stiffness[0]), wp.log(spread.contact_stiffness[1]))
+    m.contact = wp.exp(_between(logarithms, u[5]))
+    shift = _in_ball(spread.shift, u[6], u[7], u[8])
+    error = _in_ball(spread.turn, u[9], u[10], u[11])
+    s = Motion()
+    s.pose = _turned(grasps.pose[row], course.com, wp.spatial_vector(shift, error))
+    if w.lane == 0:
+        trials.mass[i] = mass
+        trials.material[i] = m
+        trials.start[i] = s.pose
+    for k in range(w.lane, hand.kin.dof_first[hand.kin.groups], w.lanes):
+        w.q[k] = grasps.pregrasp[row, hand.kin.dof_index[k]]
+    meet()
+    return s
+
+
+@wp.func
+def _keep(trials: Trials, i: wp.int32, s: Motion, w: Scratch):
+    """Write how trial i stands."""
+    if w.lane == 0:
+        trials.motion[i] = s
+    for c in range(w.lane, s.contacts, w.lanes):
+        trials.contacts[i, c] = w.contacts[c]
+    for k in range(w.lane, MAX_HAND_DOFS, w.lanes):
+        trials.q[i, k] = w.q[k]
+
+
+@wp.func
+def _kept(trials: Trials, i: wp.int32, w: Scratch):
+    """Trial i as it was kept."""
+    s = trials.motion[i]
+    for c in range(w.lane, s.contacts, w.lanes):
+        w.contacts[c] = trials.contacts[i, c]
+    for k in range(w.lane, MAX_HAND_DOFS, w.lanes):
+        w.q[k] = trials.q[i, k]
+    meet()
+    return s
+
+
 @wp.kernel(launch_bounds=BLOCKS)
-def close_hands(
+def try_grasps(
     hand: Hand,
     obj: Object,
     course: Course,
     spread: Spread,
     grasps: TriedGrasps,
+    each: wp.int32,
     workers: Workers,
     trials: Trials,
+    pulls_out: TrialPulls,
 ):
-    """Lanes of a worker, each time with the next trial: draw its numbers and close the hand on the object.
+    """Lanes of a worker, each time with the next trial: close the hand on the object, or pull the object in the next
+    ``each`` directions, which ends at the first that is not held.
+
+    One kernel for both, as compilers take long over a phase.
 
     Args:
-        trials: ``row`` and ``draw`` are given, all else is written.
+        each: 0: close.
+        trials: ``row`` and ``draw`` are given, closing writes all else.
     """
     worker, lane = wp.tid()
     w = scratch_of(workers.scratch, worker, lane)
     _describe(hand, w)
-    i = _next(workers.queue, w)
-    while i < trials.row.shape[0]:
-        row = trials.row[i]
-        rng = wp.rand_init(spread.seed, grasps.number[row])
-        u = vec_numbers()
-        for k in range(DRAWN_NUMBERS):
-            u[k] = _share(rng, spread, trials.draw[i], k)
-        m = Material()
-        m.friction = _between(spread.friction, u[0])
-        m.torsion = _between(spread.torsion, u[1])
-        mass = _between(spread.mass, u[2])
-        m.drive = _between(spread.stiffness, u[3])
-        m.drag = _between(spread.damping_ratio, u[4]) * 2.0 * wp.sqrt(m.drive * course.drive_inertia)
-        logarithms = wp.vec2(wp.log(spread.contact_stiffness[0]), wp.log(spread.contact_stiffness[1]))
-        m.contact = wp.exp(_between(logarithms, u[5]))
-        shift = _in_ball(spread.shift, u[6], u[7], u[8])
-        error = _in_ball(spread.turn, u[9], u[10], u[11])
-        s = Motion()
-        s.pose = _turned(grasps.pose[row], course.com, wp.spatial_vector(shift, error))
-        if lane == 0:
-            trials.mass[i] = mass
-            trials.material[i] = m
-            trials.start[i] = s.pose
-        for k in range(lane, hand.kin.dof_first[hand.kin.groups], w.lanes):
-            w.q[k] = grasps.pregrasp[row, hand.kin.dof_index[k]]
-        meet()
-        for phase in range(2):
-            if s.lost == 0:
-                s = _go(hand, obj, course, grasps, trials, i, phase, s, w)
-        if lane == 0:
-            trials.motion[i] = s
-        for c in range(lane, s.contacts, w.lanes):
-            trials.contacts[i, c] = w.contacts[c]
-        for k in range(lane, MAX_HAND_DOFS, w.lanes):
-            trials.q[i, k] = w.q[k]
-        meet()
-        i = _next(workers.queue, w)
-
-
-@wp.kernel(launch_bounds=BLOCKS)
-def pull_objects(
-    hand: Hand,
-    obj: Object,
-    course: Course,
-    grasps: TriedGrasps,
-    trials: Trials,
-    each: wp.int32,
-    workers: Workers,
-    pulls_out: TrialPulls,
-):
-    """Lanes of a worker, each time with the next trial and run of ``each`` directions, which ends at the first that is
-    not held."""
-    worker, lane = wp.tid()
-    w = scratch_of(workers.scratch, worker, lane)
-    _describe(hand, w)
-    runs = 6 // each
+    runs = wp.where(each == 0, 1, 6 // wp.max(each, 1))
     number = _next(workers.queue, w)
     while number < runs * trials.row.shape[0]:
         i = number // runs
-        first = number % runs * each
-        s = trials.motion[i]
-        for pull in range(first, first + each):
+        first = 2 + number % runs * each
+        last = first + each
+        s = Motion()
+        if each == 0:
+            s = _begin(course, spread, grasps, trials, i, hand, w)
+            first = 0
+        for phase in range(first, last):
+            if s.lost == 0 and phase >= 2:
+                s = _kept(trials, i, w)
             if s.lost == 0:
-                s = trials.motion[i]
-                for c in range(lane, s.contacts, w.lanes):
-                    w.contacts[c] = trials.contacts[i, c]
-                for k in range(lane, MAX_HAND_DOFS, w.lanes):
-                    w.q[k] = trials.q[i, k]
-                meet()
-                s = _go(hand, obj, course, grasps, trials, i, 2 + pull, s, w)
-                if lane == 0:
-                    pulls_out.held[i, pull] = 1 - s.lost
-                    pulls_out.displacement[i, pull] = s.displacement
+                s = _go(hand, obj, course, grasps, trials, i, phase, s, w)
+                if phase >= 2 and lane == 0:
+                    pulls_out.held[i, phase - 2] = 1 - s.lost
+                    pulls_out.displacement[i, phase - 2] = s.displacement
+        if each == 0:
+            _keep(trials, i, s, w)
         meet()
         number = _next(workers.queue, w)

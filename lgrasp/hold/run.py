@@ -17,8 +17,7 @@ from lgrasp.hold.kernels import (
     Trials,
     TriedGrasps,
     Workers,
-    close_hands,
-    pull_objects,
+    try_grasps,
 )
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.scratch import MAX_HAND_DOFS, MAX_TOUCHES, Contact, empty_scratches
@@ -161,7 +160,7 @@ class HoldTester:
         held = wp.zeros((n, ways), dtype=wp.int32, device=device)
         displacement = wp.zeros((n, ways), dtype=wp.float32, device=device)
         pulls = make_struct(TrialPulls, held=held, displacement=displacement)
-        both = [self._hand.struct, obj.struct, course]
+        both = [self._hand.struct, obj.struct, course, spread, grasps]
         # on a GPU every worker pulls one way only
         lanes = lanes_of(device)
         each, most = (1, _WORKERS) if lanes > 1 else (ways, 1)
@@ -171,8 +170,8 @@ class HoldTester:
             make_struct(Workers, scratch=scratch, queue=wp.zeros(1, dtype=wp.int32, device=device)) for _ in range(2)
         )
         how = {"device": device, "block_dim": LANES}
-        wp.launch(close_hands, (min(n, most), lanes), [*both, spread, grasps, closing, trials], **how)
-        wp.launch(pull_objects, (min(runs, most), lanes), [*both, grasps, trials, each, pulling], [pulls], **how)
+        wp.launch(try_grasps, (min(n, most), lanes), [*both, 0, closing, trials, pulls], **how)
+        wp.launch(try_grasps, (min(runs, most), lanes), [*both, each, pulling, trials, pulls], **how)
         stayed, moved = fetch([held, displacement])
         return np.all(stayed, axis=1), np.max(moved, axis=1)
 
