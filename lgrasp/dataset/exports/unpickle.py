@@ -1,17 +1,17 @@
 """Pickled numbers, texts, lists, dictionaries and NumPy arrays, read without calling anything that a file names.
 
-A pickle is a program for a small stack machine. This one knows the words that plain values and arrays need, and nothing
-else. NumPy's constructors are only noted while the program runs; afterwards each array is made from bytes whose
-number, type and shape were compared.
+NumPy's constructors are only noted while a pickle is read; afterwards each array is made from bytes whose number, type
+and shape were compared.
 """
 
 import io
 import math
-import pickletools
+import pickle
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from struct import unpack
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +20,6 @@ from lgrasp.errors import short_reason
 DEPTH = 32
 """Lists, dictionaries and arrays inside each other."""
 _NUMBERS = re.compile(r"[?]|[biufc?][0-9]{1,2}|[SU][0-9]{1,4}")  # types of elements that are read
-_VALUES = re.compile(
-    r"(LONG|BIN)?INT[12]?|LONG[14]?|(BIN)?FLOAT|(SHORT_)?(BIN)?(STRING|BYTES|UNICODE)8?|BYTEARRAY8"
-)  # words that push the value they carry
-_IGNORED = ("PROTO", "FRAME", "STOP")
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 
 
 class UnpickleError(ValueError):
@@ -39,6 +34,14 @@ class _Noted:
     args: tuple[Any, ...] | None = None  # None: the name itself
     state: Any = None
 
+    def __call__(self, *args: Any) -> "_Noted":
+        if self.args is not None:
+            raise UnpickleError("it calls something else than a name")
+        return _Noted(self.name, args)
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
 
 _NAMES = {
     "numpy ndarray": "ndarray",
@@ -50,6 +53,21 @@ _NAMES = {
 }
 
 
+class _Program(pickle._Unpickler):
+    """The words of a pickle; that in Python itself, which makes no room for numbers that a file only says."""
+
+    def find_class(self, module: str, name: str) -> _Noted:  # pyright: ignore[reportIncompatibleMethodOverride]
+        known = _NAMES.get(f"{module} {name}".replace("numpy._core", "numpy.core"))
+        if known is None:
+            raise UnpickleError(f"it would call {module}.{name}; only numbers, texts, lists and arrays are read")
+        return _Noted(known)
+
+    def _bytearray(self: Any) -> None:
+        self.append(bytearray(self.read(unpack("<Q", self.read(8))[0])))
+
+    dispatch = pickle._Unpickler.dispatch | {pickle.BYTEARRAY8[0]: _bytearray}  # pyright: ignore
+
+
 def load_plain(data: bytes) -> Any:
     """The value that a pickle holds, of any protocol and of Python 2 too (its texts as latin1).
 
@@ -58,86 +76,10 @@ def load_plain(data: bytes) -> Any:
             text or number, and arrays of bool, int, float, text, bytes or of such values.
     """
     try:
-        return _Reader(1000 + 8 * len(data)).read(_run(data), 0)
+        return _Reader(1000 + 8 * len(data)).read(_Program(io.BytesIO(data), encoding="latin1").load(), 0)
     except Exception as error:  # a damaged program fails in many ways
         reason = short_reason(error)
         raise UnpickleError(reason if isinstance(error, UnpickleError) else f"damaged: {reason}") from error
-
-
-def _run(data: bytes) -> Any:
-    """The value left by the words of a pickle; arrays as :class:`_Noted`."""
-    stack: list[Any] = []
-    marks: list[int] = []
-    memo: dict[int, Any] = {}
-
-    def above_mark() -> list[Any]:
-        at = marks.pop()
-        values = stack[at:]
-        del stack[at:]
-        return values
-
-    def top(kind: type) -> Any:
-        if type(stack[-1]) is not kind or (marks and len(stack) <= marks[-1]):
-            raise UnpickleError("it builds on something else than a list, dictionary or array")
-        return stack[-1]
-
-    for code, carried, _ in pickletools.genops(io.BytesIO(data)):
-        word, arg = code.name, cast(Any, carried)
-        if _VALUES.fullmatch(word):
-            stack.append(arg)
-        elif word in _CONSTANTS:
-            stack.append(_CONSTANTS[word])
-        elif word == "MARK":
-            marks.append(len(stack))
-        elif word in ("EMPTY_LIST", "EMPTY_DICT"):
-            stack.append([] if word == "EMPTY_LIST" else {})
-        elif word in ("LIST", "TUPLE", "DICT"):
-            values = above_mark()
-            stack.append(_dictionary(values) if word == "DICT" else list(values) if word == "LIST" else tuple(values))
-        elif word in ("TUPLE1", "TUPLE2", "TUPLE3"):
-            count = int(word[-1])
-            stack[-count:] = [tuple(stack[-count:])]
-        elif word in ("APPEND", "APPENDS"):
-            values = above_mark() if word == "APPENDS" else [stack.pop()]
-            top(list).extend(values)
-        elif word in ("SETITEM", "SETITEMS"):
-            values = above_mark() if word == "SETITEMS" else [stack.pop(-2), stack.pop()]
-            top(dict).update(_dictionary(values))
-        elif word == "MEMOIZE":
-            memo[len(memo)] = stack[-1]
-        elif word.endswith("PUT"):
-            memo[arg] = stack[-1]
-        elif word.endswith("GET"):
-            stack.append(memo[arg])
-        elif word in ("GLOBAL", "STACK_GLOBAL"):
-            module, name = arg.split(" ", 1) if word == "GLOBAL" else (stack.pop(-2), stack.pop())
-            stack.append(_named(module, name))
-        elif word == "REDUCE":
-            args, called = stack.pop(), stack.pop()
-            if type(called) is not _Noted or called.args is not None or type(args) is not tuple:
-                raise UnpickleError("it calls something else than a name")
-            stack.append(_Noted(called.name, args))
-        elif word == "BUILD":
-            state = stack.pop()
-            top(_Noted).state = state
-        elif word not in _IGNORED:
-            raise UnpickleError(f"it says {word}, which no plain value needs")
-    (value,) = stack
-    return value
-
-
-def _named(module: str, name: str) -> _Noted:
-    known = _NAMES.get(f"{module} {name}".replace("numpy._core", "numpy.core"))
-    if known is None:
-        raise UnpickleError(f"it would call {module}.{name}; only numbers, texts, lists and arrays are read")
-    return _Noted(known)
-
-
-def _dictionary(values: list[Any]) -> dict[str | int, Any]:
-    keys = values[::2]
-    if len(values) % 2 or not all(type(key) in (str, int) for key in keys):
-        raise UnpickleError("it has a dictionary by something else than texts and numbers")
-    return dict(zip(keys, values[1::2], strict=True))
 
 
 class _Reader:
@@ -160,6 +102,8 @@ class _Reader:
 
     def read(self, value: Any, depth: int) -> Any:
         """The plain value of what a program made."""
+        if isinstance(value, set | frozenset):
+            raise UnpickleError("it holds a set")
         if not isinstance(value, (list, tuple, dict, _Noted)):
             return value
         key = id(value)
@@ -179,6 +123,8 @@ class _Reader:
     def _read(self, value: Any, depth: int) -> Any:
         self._count += 1 if isinstance(value, _Noted) else len(value)
         if isinstance(value, dict):
+            if not all(type(key) in (str, int) for key in value):
+                raise UnpickleError("it has a dictionary by something else than texts and numbers")
             return {name: self.read(item, depth) for name, item in value.items()}
         if isinstance(value, _Noted):
             if value.args is None or value.name not in self._calls:
