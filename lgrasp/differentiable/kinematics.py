@@ -1,5 +1,7 @@
 """Forward kinematics of a hand in torch: batched, differentiable to any order, on any device and in any precision."""
 
+from functools import partial
+
 import numpy as np
 import torch
 
@@ -19,13 +21,7 @@ class BodyKinematics:
         depth = np.array([len(tree.path(1 + j)) - 1 for j in range(joints)])
         order = np.argsort(depth, kind="stable")
         place = np.argsort(order)  # of joint j among the sorted ones
-
-        def put(a: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device)
-
-        def index(a: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(a, dtype=torch.int64, device=device)
-
+        put, index = (partial(torch.as_tensor, dtype=kind, device=device) for kind in (dtype, torch.int64))
         axis = tree.joint_axis.astype(float)
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         K = np.cross(np.eye(3), axis[:, None])  # rows e_i x a: [a]x

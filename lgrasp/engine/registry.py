@@ -17,12 +17,11 @@ class Stage:
 
     name: str
     package: str
-    params_name: str
 
     @property
     def params(self) -> type[BaseModel]:
-        """The model of its parameters."""
-        return getattr(import_module(f"{self.package}.params"), self.params_name)
+        """The model of its parameters, ``NameParams``."""
+        return getattr(import_module(f"{self.package}.params"), f"{self.name.capitalize()}Params")
 
     @property
     def module(self) -> str:
@@ -40,21 +39,10 @@ class Stage:
         return import_module(self.module).run
 
 
-STAGES: dict[str, Stage] = {
-    "place": Stage("place", "lgrasp.stages.place", "PlaceParams"),
-    "domain": Stage("domain", "lgrasp.stages.domain", "DomainParams"),
-    "ik": Stage("ik", "lgrasp.stages.ik", "IkParams"),
-    "wrap": Stage("wrap", "lgrasp.stages.wrap", "WrapParams"),
-    "close": Stage("close", "lgrasp.stages.close", "CloseParams"),
-    "search": Stage("search", "lgrasp.stages.search", "SearchParams"),
-    "adjust": Stage("adjust", "lgrasp.stages.adjust", "AdjustParams"),
-    "filter": Stage("filter", "lgrasp.stages.filter", "FilterParams"),
-    "refine": Stage("refine", "lgrasp.stages.refine", "RefineParams"),
-    "hold": Stage("hold", "lgrasp.stages.hold", "HoldParams"),
-    "simulate": Stage("simulate", "lgrasp.stages.simulate", "SimulateParams"),
-}
+_STAGES = "place domain ik wrap close search adjust filter refine hold simulate"
+STAGES: dict[str, Stage] = {name: Stage(name, f"lgrasp.stages.{name}") for name in _STAGES.split()}
 
-SEQUENCE = Stage("sequence", "lgrasp.sequence", "SequenceParams")
+SEQUENCE = Stage("sequence", "lgrasp.sequence")
 """How a pipeline continues with the next object: not a stage of one object, but with its own parameters and version."""
 
 ORDERS = (

@@ -1,5 +1,6 @@
 """Links of a hand as solids: what of the object, or of other links, is in them or nearly so."""
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -40,15 +41,12 @@ class LinkSolids:
         self, model: HandModel, cloud: np.ndarray, margin: float, *, dtype: torch.dtype, device: str | torch.device
     ) -> None:
         self.solids = solids = hand_solids(model, LINK_POINTS)
-
-        def put(a: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device)
-
+        put = partial(torch.as_tensor, dtype=dtype, device=device)
         self._margin = margin
         self._grids = DistanceGrids([s.grid for s in solids.solids], dtype=dtype, device=device)
         self._body = torch.as_tensor(solids.body, dtype=torch.int64, device=device)
         balls = np.stack([s.ball for s in solids.solids])
-        self._centre, self._radius = put(balls[:, :3]), put(balls[:, 3])
+        self._centre, self._radius = put(balls[:, :3].copy()), put(balls[:, 3].copy())
         self._cloud = put(cloud)
         self._points = put(np.stack([link_probes(s.points) for s in solids.solids]))
         pairs = np.concatenate([solids.pairs, solids.pairs[:, ::-1]])

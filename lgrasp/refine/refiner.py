@@ -1,6 +1,7 @@
 """Refiner: gradient-based local search of grasps, fast, unrolled, or as a training loss."""
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -99,10 +100,7 @@ class Refiner(nn.Module):
         self._bodies = BodyKinematics(hand.tree, dtype=dtype, device=device)
         self._links = LinkSolids(hand, self.target.cloud, self.params.margin, dtype=dtype, device=device)
         self._block = torch.as_tensor(surface.body, dtype=torch.int64, device=device)
-
-        def put(a: object) -> torch.Tensor:
-            return torch.as_tensor(a, dtype=dtype, device=device)
-
+        put = partial(torch.as_tensor, dtype=dtype, device=device)
         self._points, self._normals, self._weight = put(surface.points), put(surface.normals), put(surface.weight)
         self._sum = float(surface.weight.sum())
         palmar = surface.weight.reshape(-1) > 0

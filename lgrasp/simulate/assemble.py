@@ -1,6 +1,5 @@
 """Scene and protocol -> MuJoCo's specification of them: bodies, solids, drives, options."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
+from lgrasp.hand.drafting.elements import set_origin
 from lgrasp.hand.pairs import ALMOST_ALWAYS
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.urdf import joint_end, numbers, parse_robot
@@ -80,11 +80,7 @@ def _weld(joint: etree._Element, value: float) -> None:
         turn = turn * Rotation.from_rotvec(step)
     for element in (*joint.iterfind("origin"), *joint.iterfind("mimic")):
         joint.remove(element)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of gimbal lock: the angles are right then too
-        rpy = turn.as_euler("xyz")
-    texts = {"xyz": " ".join(map(repr, xyz.tolist())), "rpy": " ".join(map(repr, rpy.tolist()))}
-    etree.SubElement(joint, "origin", texts)
+    set_origin(joint, xyz, turn)
     joint.set("type", "fixed")
 
 

@@ -1,6 +1,7 @@
 """The six energies of a grasp on one more object, for batches of rows, differentiable by object pose and joints."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -48,9 +49,7 @@ class GraspEnergy:
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ) -> None:
-        def put(a: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(a, dtype=dtype, device=device)
-
+        put = partial(torch.as_tensor, dtype=dtype, device=device)
         links, new = hand_solids(hand, hand_points), objects[-1]
         self.kinematics = BodyKinematics(hand.tree, dtype=dtype, device=device)
         bodies, parts = len(hand.tree.joint_dof) + 1, len(links.solids)

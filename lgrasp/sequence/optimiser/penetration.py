@@ -1,6 +1,7 @@
 """How deep rigid solids are in one another, summed over points of their surfaces, with derivatives by their poses."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -79,12 +80,7 @@ class PenetrationSums:
         dtype: torch.dtype = torch.float32,
         device: str | torch.device = "cpu",
     ) -> None:
-        def put(a: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(np.ascontiguousarray(a), dtype=dtype, device=device)
-
-        def index(a: Sequence[int] | np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(np.ascontiguousarray(a), dtype=torch.int64, device=device)
-
+        put, index = (partial(torch.as_tensor, dtype=kind, device=device) for kind in (dtype, torch.int64))
         runs = [len(s.run_ball) for s in solids]
         self.terms = terms
         self._grids = DistanceGrids([s.grid for s in solids], dtype=dtype, device=device)
