@@ -71,7 +71,7 @@ pytest: setup
 
 # Pages that are made from the code: docs/reference/cli.md.
 docs: setup
-	$(BIN)/python -m lgrasp_cli.reference
+	PYTHONPATH=tests $(BIN)/python -m support.cli_page
 
 bench: setup
 	$(BIN)/lgrasp bench

@@ -135,7 +135,6 @@ WRITTEN_BY_HAND = {
     "lgrasp/policy/model.py": "a network in memory",
     "lgrasp/runtime/kernel_cache.py": "a temporary folder",
     "lgrasp_cli/__main__.py": "standard streams",
-    "lgrasp_cli/reference.py": "a page of the documentation",
 }
 
 

@@ -22,7 +22,6 @@ from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import METRICS, ControlPoses, HoldTester
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
-from lgrasp.planning.kernels import invert_poses
 from lgrasp.planning.params import Effort, PlanParams
 from lgrasp.planning.starts import GOLDEN_ANGLE, start_poses, tilted
 from lgrasp.refine.descent import Descent
@@ -30,12 +29,15 @@ from lgrasp.refine.hands import Hands
 from lgrasp.refine.surface import farthest_points, hand_surface
 from lgrasp.refine.volume import upload_target
 from lgrasp.runtime.cores import cores
+from lgrasp.runtime.device import KERNEL_OPTIONS
 
 _CPU_STARTS = 10  # planned at a time
 _GPU_HANDS = 1 << 16  # searched at a time
 _COLLIDES = 1.0e-3  # [m]
 _WHOLE_LOAD = 5.0e-3  # [m] early in a search so much penetration is as bad as to resist nothing
 _COARSE_BOUNDS = {"max_penetration": 0.01, "max_gap": 0.012, "max_normal_angle": 60.0, "max_normal_spread": 90.0}
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 
 def _loosened(bounds: GraspBounds) -> GraspBounds:
@@ -286,3 +288,15 @@ def _tester(hand: HandArrays, obj: ObjectArrays, test: HoldTest, others: list[Ob
         return HoldTester(hand, obj, test, others)
     except ObjectError:
         return None
+
+
+@wp.kernel
+def invert_poses(pose: wp.array(dtype=wp.transform), pose_out: wp.array(dtype=wp.transform)):
+    """``T^-1``; launched over poses.
+
+    Args:
+        pose: (N,).
+        pose_out: (N,).
+    """
+    i = wp.tid()
+    pose_out[i] = wp.transform_inverse(pose[i])

@@ -1,8 +1,7 @@
 """docs/reference/cli.md says what the commands say."""
 
+from support.cli_page import cli_page
 from support.places import ROOT
-
-from lgrasp_cli.reference import cli_page
 
 PAGE = ROOT / "docs" / "reference" / "cli.md"
 

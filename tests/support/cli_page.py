@@ -3,12 +3,12 @@
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 import typer
+from support.places import ROOT
 
-_PAGE = Path(__file__).parents[1] / "docs" / "reference" / "cli.md"
+_PAGE = ROOT / "docs" / "reference" / "cli.md"
 _MANY = 2  # commands from which on an option is explained once for all
 _MARK = "## Common options\n"
 _JOB = ("--device", "--workers", "--array", "--overwrite", "--rebuild", "--json", "--cache-dir", "--quiet", "--verbose")
