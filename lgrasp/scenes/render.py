@@ -8,9 +8,8 @@ import warp as wp
 from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.depth import Images, LabelledMesh
-from lgrasp.runtime.device import start
+from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.fetch import to_numpy
-from lgrasp.scenes import render_kernels as kernels
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.records import CloudRecord
 from lgrasp.scenes.schema import DEPTH_UNIT
@@ -19,6 +18,8 @@ TABLE = 0
 """Label of the table; object k is k + 1."""
 
 _SLOPE = 6.0  # tangent of the steepest angle to the image plane at which neighbouring pixels still lie on one surface
+
+wp.set_module_options(KERNEL_OPTIONS)
 
 
 def table_surface(side: float) -> LabelledMesh:
@@ -37,7 +38,7 @@ def image_normals(images: Images, window: int, device: str) -> np.ndarray:
         out = wp.empty(images.depth.shape, dtype=wp.vec3)
         step = _SLOPE / min(images.intrinsics.fx, images.intrinsics.fy)
         inputs = [wp.array(points, dtype=wp.vec3), window, step]
-        wp.launch(kernels.fit_normals, images.depth.shape, inputs, [out])
+        wp.launch(fit_normals, images.depth.shape, inputs, [out])
         normals = to_numpy(out)
     R = pose_matrix(images.pose)[:, :3, :3].astype(np.float32)
     return np.einsum("vab,vhwb->vhwa", R, normals)
@@ -73,3 +74,58 @@ def merge_views(images: Images, offsets: np.ndarray, params: CameraParams, devic
         labels=images.labels[v, i, j].astype(np.int16),
         view=v.astype(np.int16),
     )
+
+
+@wp.kernel
+def fit_normals(
+    point: wp.array3d(dtype=wp.vec3),
+    window: wp.int32,
+    step: wp.float32,
+    # out
+    normal_out: wp.array3d(dtype=wp.vec3),
+):
+    """One thread per (view, row, column): normal of the plane through the pixels around, turned to the camera.
+
+    Of the window only points count whose depth differs by less than ``step`` times the depth per pixel in between. Zero
+    where fewer than six do, or where they lie on a line.
+
+    Args:
+        point: camera frame [m], zero where nothing was seen, (V, rows, columns).
+        normal_out: camera frame, (V, rows, columns).
+    """
+    v, i, j = wp.tid()
+    p = point[v, i, j]
+    normal_out[v, i, j] = wp.vec3(0.0)
+    if p[2] <= 0.0:
+        return
+    rows = point.shape[1]
+    columns = point.shape[2]
+    count = float(0.0)
+    total = wp.vec3(0.0)
+    spread = wp.mat33(0.0)
+    for a in range(wp.max(i - window, 0), wp.min(i + window + 1, rows)):
+        for b in range(wp.max(j - window, 0), wp.min(j + window + 1, columns)):
+            near = point[v, a, b] - p
+            apart = float(wp.max(wp.abs(a - i), wp.abs(b - j)))
+            if point[v, a, b][2] > 0.0 and wp.abs(near[2]) <= step * p[2] * wp.max(apart, 1.0):
+                count = count + 1.0
+                total = total + near
+                spread = spread + wp.outer(near, near)
+    if count < 6.0:
+        return
+    spread = spread - wp.outer(total, total) / count
+    largest = wp.trace(spread)
+    if largest <= 0.0:
+        return
+    axes, sizes = wp.eig3(spread / largest)
+    least = int(0)
+    for k in range(1, 3):
+        if sizes[k] < sizes[least]:
+            least = k
+    middle = 1.0 - sizes[least] - wp.max(sizes)
+    if middle < 1.0e-3:
+        return
+    n = wp.normalize(wp.vec3(axes[0, least], axes[1, least], axes[2, least]))
+    if wp.dot(n, p) > 0.0:
+        n = -n
+    normal_out[v, i, j] = n

@@ -40,7 +40,7 @@ def quick():
 def shared_cache(cache_root):
     """The cache of all tests; compiled kernels stay in the user's."""
     start()
-    load_kernels("cpu", ["lgrasp.grasp.near_kernels"])  # commands tell when a machine has none
+    load_kernels("cpu", ["lgrasp.grasp.duplicates"])  # commands tell when a machine has none
     return cache_root
 
 

@@ -32,7 +32,7 @@ def test_the_compiler_knows_the_architectures():
 
 
 @pytest.mark.parametrize(
-    ("name", "arch"), [(name, OLDEST) for name in kernel_modules()] + [("lgrasp.picture.depth_kernels", NEWEST)]
+    ("name", "arch"), [(name, OLDEST) for name in kernel_modules()] + [("lgrasp.picture.depth", NEWEST)]
 )
 def test_kernels_compile(name, arch, tmp_path, monkeypatch):
     """What compiled is noted beside the compiled kernels, by the hash that Warp tells changed ones by."""
