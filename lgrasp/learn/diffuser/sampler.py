@@ -138,6 +138,7 @@ class StepSampler:
         seed: int,
         steps: int = 10,
         pool: Executor | None = None,
+        view: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> DrawnSteps:
         """``each`` steps for each of H hands, those of one hand one after another: the object after those held.
 
@@ -148,23 +149,8 @@ class StepSampler:
             space: opposition spaces, (H,). free: joints that the steps may move, (H, K) bool.
             steps: of the sampling.
             pool: threads that work on batches on a CPU.
+            view: axes (3, 3) and origin (3,) [m] of the object's frame in another one, of which the poses are then.
         """
-        R, t, q = self.motions(hands, space, free, each=each, seed=seed, steps=steps, pool=pool)
-        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), q.cpu().numpy())
-
-    @torch.no_grad()
-    def motions(
-        self,
-        hands: HeldHands,
-        space: np.ndarray,
-        free: np.ndarray,
-        *,
-        each: int,
-        seed: int,
-        steps: int,
-        pool: Executor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The same on the device: R (N, 3, 3), t (N, 3) [m] and joints (N, K)."""
         rows, joints = hands.q.shape
         number = hands.pose.shape[1]
         start, held = self._put(hands.q), self._held(hands, number)
@@ -190,7 +176,11 @@ class StepSampler:
 
         parts = _in_threads(work, _batches(count, self._device), pool if self._device.type == "cpu" else None)
         R, t, q = (torch.cat(x)[:count] for x in zip(*parts, strict=True))
-        return R, t, q
+        if view:
+            view_R, view_t = map(self._put, view)
+            R = R @ view_R.mT
+            t = t - R @ view_t
+        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), q.cpu().numpy())
 
     def warm(self, rows: int, each: int) -> None:
         """Draw as for ``rows`` hands, empty ones and those that hold something: a GPU loads what it runs when it first

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from lgrasp.cloud.model import completed_object
-from lgrasp.geometry.rotations import pose_from_motion
 from lgrasp.grasp.sequences import HeldHands
 from lgrasp.hand.tree import Tree
 from lgrasp.learn.diffuser.sampler import DrawnSteps, StepSampler
@@ -83,11 +82,9 @@ class GraspPredictor(CloudCompletion):
             np.zeros((1, len(tree.joint_open)), bool),
             np.zeros((1, 0, 7), np.float32),
         )
-        R, t, q = self._sampler.motions(hands, np.zeros(1, int), ~hands.used, each=count, seed=seed, steps=steps)
-        view_R, view_t = (torch.as_tensor(x, dtype=torch.float32, device=R.device) for x in (self.view.R, self.view.t))
-        R = R @ view_R.mT
-        t = t - R @ view_t
-        return DrawnSteps(pose_from_motion(R, t).cpu().numpy(), q.cpu().numpy())
+        return self._sampler.draw(
+            hands, np.zeros(1, int), ~hands.used, each=count, seed=seed, steps=steps, view=(self.view.R, self.view.t)
+        )
 
     @cached_property
     def _sampler(self) -> StepSampler:
