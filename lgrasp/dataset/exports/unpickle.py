@@ -7,11 +7,13 @@ and shape were compared.
 import io
 import math
 import pickle
+import pickletools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from struct import unpack
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,6 +21,9 @@ from lgrasp.errors import short_reason
 
 DEPTH = 32
 """Lists, dictionaries and arrays inside each other."""
+_NEEDLESS = re.compile(  # words of other values
+    r"(BIN)?PERSID|EXT[124]|INST|OBJ|NEWOBJ(_EX)?|EMPTY_SET|ADDITEMS|FROZENSET|(NEXT|READONLY)_BUFFER|DUP|POP(_MARK)?"
+)
 _NUMBERS = re.compile(r"[?]|[biufc?][0-9]{1,2}|[SU][0-9]{1,4}")  # types of elements that are read
 
 
@@ -39,9 +44,6 @@ class _Noted:
             raise UnpickleError("it calls something else than a name")
         return _Noted(self.name, args)
 
-    def __setstate__(self, state: Any) -> None:
-        self.state = state
-
 
 _NAMES = {
     "numpy ndarray": "ndarray",
@@ -51,6 +53,10 @@ _NAMES = {
     "numpy.core.numeric _frombuffer": "buffer",
     "_codecs encode": "bytes",
 }
+
+
+def _refuse(word: str, _: pickle._Unpickler) -> None:  # pyright: ignore
+    raise UnpickleError(f"it says {word}, which no plain value needs")
 
 
 class _Program(pickle._Unpickler):
@@ -65,7 +71,18 @@ class _Program(pickle._Unpickler):
     def _bytearray(self: Any) -> None:
         self.append(bytearray(self.read(unpack("<Q", self.read(8))[0])))
 
-    dispatch = pickle._Unpickler.dispatch | {pickle.BYTEARRAY8[0]: _bytearray}  # pyright: ignore
+    def _build(self: Any) -> None:
+        state = self.stack.pop()
+        if not isinstance(self.stack[-1], _Noted):
+            raise UnpickleError("it builds on something else than a list, dictionary or array")
+        self.stack[-1].state = state
+
+    dispatch: ClassVar = {
+        **pickle._Unpickler.dispatch,  # pyright: ignore
+        **{ord(op.code): partial(_refuse, op.name) for op in pickletools.opcodes if _NEEDLESS.fullmatch(op.name)},
+        pickle.BYTEARRAY8[0]: _bytearray,
+        pickle.BUILD[0]: _build,
+    }
 
 
 def load_plain(data: bytes) -> Any:
@@ -102,8 +119,6 @@ class _Reader:
 
     def read(self, value: Any, depth: int) -> Any:
         """The plain value of what a program made."""
-        if isinstance(value, set | frozenset):
-            raise UnpickleError("it holds a set")
         if not isinstance(value, (list, tuple, dict, _Noted)):
             return value
         key = id(value)
