@@ -123,7 +123,8 @@ class Pipeline(_Head):
         the object must be near by."""
         points = max(self.object.contact_count, self.params("close").contact_count)
         dense = self.object.model_copy(update={"contact_count": points})
-        kept = self.without("domain", "ik", "wrap").with_params("place", samples=0)
+        proposals = min(self.params("place").policy_proposals, self.params("close").policy_proposals)
+        kept = self.without("domain", "ik", "wrap").with_params("place", samples=0, policy_proposals=proposals)
         return kept.model_copy(update={"object": dense})
 
     def without(self, *stages: str) -> "Pipeline":

@@ -27,6 +27,12 @@ class CloseParams(Params):
         description="Values of joints that fingers share, such as a spread: tried at a pose, one after another, until "
         "enough fingers touch.",
     )
+    policy_proposals: int = Field(
+        default=32,
+        ge=1,
+        le=1024,
+        description="Poses that a policy rates per candidate, at most (place.policy_proposals).",
+    )
     contact_count: int = Field(
         default=8192, ge=64, le=65536, description="Contact points of objects, at least (object.contact_count)."
     )

@@ -1,5 +1,6 @@
 """How promising a pose of an object is: opposed contacts that fingers can reach there."""
 
+import numpy as np
 import warp as wp
 
 from lgrasp.field.arrays import Field, field_has
@@ -193,3 +194,9 @@ def rate_pose(
     chance -= params.policy_temperature * wp.log(-wp.log(luck))  # Gumbel's distribution
     steps = int(_CHANCE_STEPS * (wp.clamp(chance, -_MOST_CHANCE, _MOST_CHANCE) + _MOST_CHANCE))
     return steps * _PAIRS + wp.min(pairs, _PAIRS - 1)
+
+
+def rated_chance(rating: np.ndarray) -> np.ndarray:
+    """The chances that ratings by a policy stand for, with nothing added; 0 where there is no such rating."""
+    chance = np.exp(rating // _PAIRS / float(_CHANCE_STEPS) - float(_MOST_CHANCE))
+    return np.where(rating >= _PAIRS, chance, 0.0)

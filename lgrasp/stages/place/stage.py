@@ -9,13 +9,14 @@ from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
+from lgrasp.stages.place.favoured import favoured_palm
 from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed
 from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.predicted_kernels import propose_predicted
 from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses
 
-VERSION = 9
+VERSION = 10
 
 
 def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:
@@ -48,7 +49,10 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     values = make_struct(PlaceValues, params, context.bounds, **shares, max_com_distance=reach)
     where = [context.seed("place"), first]
     if not context.opposed:
-        kernel, asked = propose_poses, [values, context.steered.struct, context.networks.reach]
+        steer = context.steered.struct
+        if rated and params.samples == 0 and shares["palm"] > 0 and context.steered.poses is None:
+            steer = favoured_palm(values, context)
+        kernel, asked = propose_poses, [values, steer, context.networks.reach]
     elif context.predicted is None:
         kernel, asked = propose_opposed, [context.held.struct, values]
     else:

@@ -2,10 +2,11 @@
 
 import warp as wp
 
+from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.grasp.check_kernels import contact_fit
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
-from lgrasp.math.sdf import sdf_gradient
+from lgrasp.math.sdf import Sdf, sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -16,6 +17,7 @@ _SAME_FACET = wp.constant(0.9)  # cosine of the turn of a normal that does not c
 _TOO_DEEP = wp.constant(0.0001)  # [m] more than a link aims to press in: the step after next is not as deep
 _REACH = wp.constant(0.005)  # [m] from a touch to the contact point of the object that stands for it
 _GAP_WEIGHT = wp.constant(30.0)  # [1/m] beside the cosine of the normals: 0.1 mm is worth 1 degree at 10 degrees
+_WORTHLESS = wp.constant(-1.0e6)
 
 
 @wp.struct
@@ -95,25 +97,35 @@ def touches_there(hand: Hand, obj: Object, params: WrapValues, grid: wp.int32, T
 
 
 @wp.func
+def _worth(
+    obj: Object, params: WrapValues, sdf: Sdf, T: wp.transform, T_body: wp.transform, touch: LinkTouch, k: wp.int32
+):
+    """How well contact point k of the object stands for a touch, if it is near by. sdf: of the link."""
+    p = obj.contact_points[k]
+    if wp.length_sq(p - touch.foot) >= _REACH * _REACH:
+        return _WORTHLESS
+    s = sdf_gradient(sdf, wp.transform_point(T_body, p))
+    facing = -wp.dot(wp.transform_vector(T, wp.vec3(s[0], s[1], s[2])), obj.contact_normals[k])
+    if facing <= params.cosine or wp.abs(s[3]) >= params.max_gap:
+        return _WORTHLESS
+    if wp.dot(obj.contact_normals[k], touch.normal) <= params.min_spread_cosine:
+        return _WORTHLESS
+    return facing - _GAP_WEIGHT * wp.abs(s[3])
+
+
+@wp.func
 def contact_beside(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues, T: wp.transform, touch: LinkTouch):
     """Contact point of the object that stands for a touch, -1 if none near by is a contact of the link's mesh."""
     best = int(-1)
-    least = float(0.0)
+    most = float(_WORTHLESS)
     sdf = hand_grid(hand.contacts, runs.grid[touch.run])
     T_body = wp.transform_inverse(T)
-    for k in range(obj.contacts):
-        p = obj.contact_points[k]
-        if wp.length_sq(p - touch.foot) < _REACH * _REACH:
-            s = sdf_gradient(sdf, wp.transform_point(T_body, p))
-            facing = -wp.dot(wp.transform_vector(T, wp.vec3(s[0], s[1], s[2])), obj.contact_normals[k])
-            worth = facing - _GAP_WEIGHT * wp.abs(s[3])
-            if best >= 0 and worth <= least:
-                continue
-            if facing <= params.cosine or wp.abs(s[3]) >= params.max_gap:
-                continue
-            if wp.dot(obj.contact_normals[k], touch.normal) <= params.min_spread_cosine:
-                continue
-            if touches_there(hand, obj, params, runs.grid[touch.run], T, k):
-                least = worth
-                best = k
+    for run in range(obj.contact_sphere.shape[0]):
+        ball = obj.contact_sphere[run]
+        if wp.length(wp.vec3(ball[0], ball[1], ball[2]) - touch.foot) < _REACH + ball[3]:
+            for k in range(run * CLUSTER_SIZE, wp.min((run + 1) * CLUSTER_SIZE, obj.contacts)):
+                worth = _worth(obj, params, sdf, T, T_body, touch, k)
+                if worth > most and touches_there(hand, obj, params, runs.grid[touch.run], T, k):
+                    most = worth
+                    best = k
     return best

@@ -86,9 +86,10 @@ def barrett(load, power):
 
 def test_the_hand_decides(power):
     assert power.order == ("place", "close", "search", "filter")
-    # the object has more contact points, and its distances alone rate poses
+    # the object has more contact points, and its distances alone rate poses, which are fewer
     given = load_pipeline("power")
-    assert (power.object.contact_count, power.params("place").samples) == (8192, 0)
+    place = power.params("place")
+    assert (power.object.contact_count, place.samples, place.policy_proposals) == (8192, 0, 32)
     assert for_hand(given, "allegro").object == given.object
     assert for_hand(given, "allegro").params("place").samples == given.params("place").samples
     assert for_hand(load_pipeline("power"), "allegro").order == ("place", "domain", "ik", "wrap", "search", "filter")
