@@ -14,7 +14,7 @@ from lgrasp.steer.arrays import Steer
 _DRAWS = 128  # poses for each point of the palm
 _SEED = 1  # of these: the same in all shards
 _ENTRIES = 4096  # of the list that points are drawn from
-_EVERYWHERE = 0.05  # of the mean chance, added to that of each point
+_EVERYWHERE = 0.6  # of the mean chance, added to that of each point
 
 
 def favoured_palm(values: PlaceValues, context: Context) -> Steer:
