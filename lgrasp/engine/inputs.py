@@ -238,7 +238,7 @@ def load_inputs(
     planes = load.planes(object_model, keys.object) if table and not steer.above else steer.plane
     left = object_model
     if steer.touch or steer.avoid:
-        from lgrasp.object.regions import steer_object, surface_weights  # slow to load
+        from lgrasp.object.steered import steer_object, surface_weights  # slow to load
 
         weights = surface_weights(object_model, steer.touch_regions, steer.avoid_regions, keys.mesh, device=alias)
         left = steer_object(object_model, weights, seed=objects.seed, device=alias)

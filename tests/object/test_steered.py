@@ -10,7 +10,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.object.model import SurfaceWeights
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.object.region_text import parse_regions
-from lgrasp.object.regions import steer_object, surface_weights
+from lgrasp.object.steered import steer_object, surface_weights
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_share_of_the_draws(ball, from_, share, drawn):
 
 
 def test_the_share_is_drawn_however_many_points_there_are(ball, monkeypatch):
-    monkeypatch.setattr("lgrasp.object.regions._DRAWS", 0)
+    monkeypatch.setattr("lgrasp.object.steered._DRAWS", 0)
     on = (ball.points[:, 0] >= 0.1).astype(float)
     steered = steer_object(ball.model, weighted(ball, touch=on, share=0.7))
     assert steered.touch.mean() == pytest.approx(0.7, abs=0.01)

@@ -15,7 +15,7 @@ from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.simulate.protocol import GRAVITY, PROTOCOLS, Draws, Protocol, Shake
 from lgrasp.simulate.run import protocol_text
 from lgrasp.simulate.scene import scene_of
-from lgrasp.simulate.trial import shake_course
+from lgrasp.simulate.shake import shake_course
 from lgrasp.simulate.verdict import AXES
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")

@@ -19,23 +19,21 @@ from lgrasp.files import new_folder, temporary_folder
 from lgrasp.geometry.mesh_files import mesh_bytes
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.digest import hand_digest
+from lgrasp.hand.drafting.couplings import left_out_couplings
 from lgrasp.hand.drafting.cut_hand import cut_hand, hand_roots
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.mjcf import mjcf_to_urdf
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
-from lgrasp.hand.names import known_hands
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
-from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, read_robot
+from lgrasp.hand.urdf import check_robot, find_mesh, is_mjcf, read_robot
 from lgrasp.paths import cache_dir, user_dir
 
 _UNINFORMATIVE_NAMES = {"hand", "robot", "model", "urdf", "gripper"}
 _DRAFT_VERSION = 3
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
-
-_MOST_FILES = 30
 
 
 @dataclass(frozen=True)
@@ -265,28 +263,3 @@ def drafted_folder(urdf: Path, name: str) -> Path:
     except HandError:  # not drafted yet, or unreadable
         import_urdf(urdf, name=name, out=folder, force=folder.exists())
     return folder
-
-
-def left_out_couplings(urdf: Path, robot: etree._Element) -> list[str]:
-    """At most one line: joints without <mimic> that another URDF of the folder, or of a known hand, couples; all joints
-    of that URDF are joints of this ``robot``."""
-    names, coupled = _joints(robot)
-    beside = (path for path in sorted(urdf.parent.glob("*.urdf")) if path.name != urdf.name)
-    known = (folder / "hand.urdf" for folder in known_hands().values())
-    for other in itertools.islice(itertools.chain(known, beside), _MOST_FILES):
-        try:
-            its_names, its_coupled = _joints(read_robot(other)[0])
-        except HandError:
-            continue
-        if its_names <= names and (missing := sorted(its_coupled - coupled)):
-            return [
-                f"note: this URDF has no <mimic> for {', '.join(missing)}, which {other} has: if they have no drive of "
-                "their own, say so (mimic)"
-            ]
-    return []
-
-
-def _joints(robot: etree._Element) -> tuple[set[str], set[str]]:
-    """Names of the joints that move, and of those that mimic another."""
-    moving = [joint for joint in robot.iter("joint") if joint.get("type") in MOVABLE]
-    return {j.get("name", "") for j in moving}, {j.get("name", "") for j in moving if j.find("mimic") is not None}
