@@ -53,13 +53,14 @@ def bounding_spheres(points: np.ndarray, *, size: int = CLUSTER_SIZE) -> tuple[n
     """Nearly smallest balls around runs of ``size`` points (Bădoiu–Clarkson core-set iteration).
 
     Args:
-        points: Points [m], shape (n, 3), n a multiple of ``size``.
+        points: Points [m], shape (n, 3); the last run may be shorter.
         size: Points of a run.
 
     Returns:
-        Centres [m], shape (n / size, 3), and radii [m], shape (n / size,), f32, rounded up.
+        Centres [m], shape (k, 3), and radii [m], shape (k,), of the k = ceil(n / size) runs, f32, rounded up.
     """
-    group = np.asarray(points, np.float64).reshape(-1, size, 3)  # (k, c, 3)
+    full = np.pad(np.asarray(points, np.float64), ((0, -len(points) % size), (0, 0)), mode="edge")
+    group = full.reshape(-1, size, 3)  # (k, c, 3)
     center = group.mean(axis=1)
     row = np.arange(len(group))
     for step in range(1, _BALL_STEPS + 1):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres
+from lgrasp.geometry.clusters import bounding_spheres
 from lgrasp.math.sdf import Sdf, block_minima
 from lgrasp.object.model import ObjectModel, SteeredObject
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -75,7 +75,7 @@ def upload_object(model: ObjectModel | SteeredObject, device: str, planes: np.nd
     same = {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")}
     others = {
         "sdf": upload_struct(Sdf, device, {**grid, "first": 0, "nx": nx, "ny": ny, "nz": nz}),
-        "contact_sphere": _spheres(model.contact_points),
+        "contact_sphere": np.column_stack(bounding_spheres(model.contact_points)),
         "contacts": len(model.contact_points),
         "obstacles": model.obstacle_points,
         "cluster_sphere": np.column_stack([model.cluster_center, model.cluster_radius]),
@@ -90,9 +90,3 @@ def upload_object(model: ObjectModel | SteeredObject, device: str, planes: np.nd
         others["resting"] = upload_struct(Resting, device, resting | {"count": len(planes)})
     struct = upload_struct(Object, device, same | others)
     return ObjectArrays(model, device, struct, planes, steered, touch)
-
-
-def _spheres(points: np.ndarray) -> np.ndarray:
-    """Balls (k, 4) around runs of ``CLUSTER_SIZE`` of the points (n, 3), the last of which may be shorter."""
-    full = np.pad(points, ((0, -len(points) % CLUSTER_SIZE), (0, 0)), mode="edge")
-    return np.column_stack(bounding_spheres(full))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lgrasp.errors import ConfigError
+from lgrasp.geometry.shares import entries_of
 from lgrasp.object.model import ObjectModel, SteeredObject, SurfaceWeights
 from lgrasp.object.region_text import Region
 from lgrasp.object.regions import MEMBER, region_weights
@@ -58,8 +59,7 @@ def steer_object(model: ObjectModel, weights: SurfaceWeights, *, seed: int = 0, 
     density = asked + rest
     often = (density > 0).astype(int)
     if np.ptp(density[density > 0]) > 1e-6 * density.max():
-        upto = np.cumsum(density) / density.sum() * max(_DRAWS, 2 * n)
-        often = np.diff(np.rint(upto).astype(int), prepend=0)
+        often = entries_of(density, max(_DRAWS, 2 * n))
     rows = np.repeat(np.arange(n), often)
     points, normals = model.contact_points[rows], model.contact_normals[rows]
     opposite = opposite_points(points, normals, seed=seed, device=device)

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from lgrasp.geometry.shares import entries_of
 from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.stages.context import Context
@@ -38,8 +39,7 @@ def favoured_palm(values: PlaceValues, context: Context) -> Steer:
             return steer
         point, ends = to_numpy(proposals.palm_point).ravel(), int(palm.max()) + 1
         mean = np.bincount(point, chance, ends) / np.maximum(np.bincount(point, minlength=ends), 1)
-        upto = np.cumsum(mean[palm] + _EVERYWHERE * mean[palm].mean())
-        often = np.diff(np.rint(upto / upto[-1] * _ENTRIES).astype(int), prepend=0)
+        often = entries_of(mean[palm] + _EVERYWHERE * mean[palm].mean(), _ENTRIES)
         return make_struct(Steer, steer, palm_points=wp.array(np.repeat(palm, often), dtype=wp.int32, device=d))
 
     return context.once("place", make, context.steered, context.policy, context.bounds)
