@@ -139,22 +139,27 @@ def context(inputs: Inputs) -> Context:
     return Context(inputs.hand, inputs.object, inputs.field, "cpu", 0, 0)
 
 
-@pytest.fixture
-def job(swift: Pipeline, cache_root: Path, tmp_path: Path) -> Callable[..., GenerateJob]:
-    """A small job on the CPU; keywords replace fields of :class:`GenerateJob`."""
-    defaults = {
+@pytest.fixture(scope="session")
+def small_job(swift: Pipeline, cache_root: Path) -> dict[str, Any]:
+    """Fields of a small :class:`GenerateJob` on the CPU, but for its folder."""
+    return {
         "hand": "allegro",
         "object": OBJECT,
         "rows": 60,
         "pipeline": swift,
-        "out": tmp_path / "out",
         "shard_rows": 20,
         "device": "cpu",
         "workers": 1,
         "batch": 128,
         "cache": Cache(cache_root, pytest.fail),
     }
-    return lambda **changes: parse_model(GenerateJob, defaults | changes, "generate")
+
+
+@pytest.fixture
+def job(small_job: dict[str, Any], tmp_path: Path) -> Callable[..., GenerateJob]:
+    """A small job on the CPU; keywords replace fields of :class:`GenerateJob`."""
+    given = small_job | {"out": tmp_path / "out"}
+    return lambda **changes: parse_model(GenerateJob, given | changes, "generate")
 
 
 @pytest.fixture

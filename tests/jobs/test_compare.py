@@ -16,6 +16,8 @@ from lgrasp.errors import ConfigError, HandError
 from lgrasp.jobs.compare.job import CompareJob
 from lgrasp.jobs.requests.compare import CompareRequest, parse_variations
 
+ROWS = 4
+
 
 @pytest.fixture(scope="module")
 def tasks(cache_root, tmp_path_factory):
@@ -25,7 +27,7 @@ def tasks(cache_root, tmp_path_factory):
         "hands": ("allegro",),
         "objects": ("sphere",),
         "vary": ("link_scale:1.1",),
-        "rows": 12,
+        "rows": ROWS,
         "pipeline": QUICK,
     }
     job = CompareJob(**given, out=out, device="cpu", workers=1, cache=Cache(cache_root))
@@ -51,13 +53,13 @@ def test_numbers_are_those_of_the_shards(compared):
         assert validate_shard(path) == []
         cell = hand["objects"]["sphere"]
         with ShardReader(path) as reader:
-            assert cell["rows"] == len(reader) == 12
+            assert cell["rows"] == len(reader) == ROWS
             assert cell["hold"] == pytest.approx(reader.column("metrics/hold_success").mean())
             assert cell["epsilon"] == pytest.approx(float(np.median(reader.column("metrics/epsilon"))))
             kept, tried = (float(reader.statistics[name]) for name in ("filter_kept", "candidates"))
             assert cell["yield"] == pytest.approx(kept / tried)  # all rows are strict
         assert 0 < cell["surface"] < 1
-        assert 0 < cell["approach"] <= 12 / 288
+        assert 0 < cell["approach"] <= ROWS / 288
         assert hand["all"]["yield"] == cell["yield"]  # the mean over one object
         assert hand["all"]["pca_ratio"] == cell["pca_ratio"]
     small, large = (hand["workspace"] for hand in data["hands"])

@@ -11,18 +11,16 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-import yaml
 from support.places import QUICK
+from support.sequences import OBJECTS, small_pipeline
 from support.urdfs import arm
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.events import Events
-from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import Job, run
-from lgrasp.hand.find import find_hand
 from lgrasp.jobs.compare.job import CompareJob
 from lgrasp.jobs.export import ExportJob
 from lgrasp.jobs.generate import GenerateJob, generate
@@ -57,45 +55,27 @@ NAMES = (
 
 
 @pytest.fixture(scope="module")
-def shards(swift, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, int], Path]:
+def shards(small_job, tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, int], Path]:
     """shards(rows, shard_rows): a folder of grasps of a ball, which physics takes as it is."""
 
     @cache
     def shards(rows: int, shard_rows: int) -> Path:
         out = tmp_path_factory.mktemp("source")
-        given = {
-            "object": "sphere",
-            "rows": rows,
-            "shard_rows": shard_rows,
-            "batch": 128,
-            "workers": 1,
-            "device": "cpu",
-        }
-        generate(GenerateJob(**given, pipeline=swift, out=out, cache=Cache(cache_root)))
+        changes = {"object": "sphere", "rows": rows, "shard_rows": shard_rows, "out": out}
+        generate(GenerateJob(**small_job | changes))
         return out
 
     return shards
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def source(shards) -> Path:
     """Two shards of three grasps."""
     return shards(6, 3)
 
 
 @pytest.fixture(scope="module")
-def two_spaces(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A hand with two opposition spaces: each takes a while to prepare."""
-    folder = tmp_path_factory.mktemp("hands") / "allegro"
-    shutil.copytree(find_hand("allegro").urdf.parent, folder)
-    rules = yaml.safe_load((folder / "hand.yaml").read_text())
-    rules["opposition_spaces"] = {name: rules["opposition_spaces"][name] for name in ("thumb-index", "middle-ring")}
-    (folder / "hand.yaml").write_text(yaml.safe_dump(rules, sort_keys=False))
-    return str(folder)
-
-
-@pytest.fixture
-def jobs(swift, source: Path, shards, two_spaces: str, cache_root: Path) -> Callable[[str, Path], Job]:
+def jobs(swift, source: Path, shards, cache_root: Path) -> Callable[[str, Path], Job]:
     """jobs(name, out): a small job of each kind."""
 
     def make(name: str, out: Path) -> Job:
@@ -108,12 +88,10 @@ def jobs(swift, source: Path, shards, two_spaces: str, cache_root: Path) -> Call
             made["arm"] = arm(source.parent)
             return ReachJob(**made, at=Placement(position=(0.4, 0.0, 0.3)), tries=4)
         if name == "generate":
-            return GenerateJob(**base, object="mug", rows=12, shard_rows=4, batch=128, pipeline=swift)
+            return GenerateJob(**base, object="mug", rows=8, shard_rows=4, batch=128, pipeline=swift)
         if name == "sequence":
-            pipeline = load_pipeline("sequence").with_settings(["field.records=4000", "sequence.width=12"])
-            pipeline = pipeline.with_params("sequence", wave=64, waves=2)
-            given = base | {"objects": ("sphere", "mug"), "scale": "0.06:0.08", "rows": 2, "shard_rows": 1}
-            return SequenceJob(**given, hand=two_spaces, pipeline=pipeline)
+            given = base | {"objects": OBJECTS, "scale": "0.06:0.08", "rows": 2, "shard_rows": 1}
+            return SequenceJob(**given, pipeline=small_pipeline(width=12, waves=2))
         if name == "scenes":
             pytest.importorskip("mujoco")
             scene = {"objects": 1, "grasps": 4, "colliding": 2, "camera": {"views": 1, "width": 64, "height": 48}}
@@ -127,7 +105,7 @@ def jobs(swift, source: Path, shards, two_spaces: str, cache_root: Path) -> Call
         if name == "export":
             return ExportJob(**made, to="dexgraspnet")
         if name == "compare":
-            return CompareJob(**base, hands=("allegro",), objects=("sphere", "mug"), rows=3, pipeline=QUICK)
+            return CompareJob(**base, hands=("allegro",), objects=("sphere", "tiny"), rows=2, pipeline=QUICK)
         if name == "refine":
             return RefineJob(**made, params=RefineParams(matching_rounds=1))
         return MetricsJob(**made, add=("volume",))
@@ -178,38 +156,44 @@ class Shown(Bar):
         self.last = done, total
 
 
+@pytest.fixture(scope="module")
+def whole(jobs, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[JobOutcome, Shown]]:
+    """whole(name): a job that was run at once, and what its bar showed."""
+
+    @cache
+    def whole(name: str) -> tuple[JobOutcome, Shown]:
+        bar = Shown()
+        return run(jobs(name, tmp_path_factory.mktemp(name) / "out"), JobProgress(bar, "rows")), bar
+
+    return whole
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_tasks_resume_and_stop(jobs, tmp_path: Path, name: str):
-    bar = Shown()
-    whole = run(jobs(name, tmp_path / "whole"), JobProgress(bar, "rows"))
-    assert whole.rows > 0
-    assert bar.last == (sum(part.rows for part in whole.parts) or whole.rows,) * 2
-    expected = contents(tmp_path / "whole")
-    for task in (1, 0):
-        run(jobs(name, tmp_path / "array"), array=(task, 2))
-    assert contents(tmp_path / "array") == expected
-    again = run(jobs(name, tmp_path / "array"))
-    assert (again.made, again.present) == (0, whole.rows)
-    stopped = run(jobs(name, tmp_path / "cut"), Stop())
+def test_tasks_resume_and_stop(jobs, whole, tmp_path: Path, name: str):
+    outcome, bar = whole(name)
+    assert outcome.rows > 0
+    assert bar.last == (sum(part.rows for part in outcome.parts) or outcome.rows,) * 2
+    stopped = run(jobs(name, tmp_path), Stop())
     assert stopped.cancelled
     assert not stopped.paths
-    done = run(jobs(name, tmp_path / "cut"))
-    assert not done.cancelled
-    assert contents(tmp_path / "cut") == expected
-    data = job_report(done)
+    assert not any(run(jobs(name, tmp_path), array=(task, 2)).cancelled for task in (1, 0))
+    assert contents(tmp_path) == contents(outcome.job.folder)
+    again = run(jobs(name, tmp_path))
+    assert (again.made, again.present) == (0, outcome.rows)
+    data = job_report(outcome)
     assert json.loads(json.dumps(data)) == data
     assert {"asked", "made", "present", "out", "shards", "device", "seconds", "starved", "cancelled"} <= set(data)
 
 
 @pytest.mark.parametrize("name", ["generate", "refine", "simulate", "metrics"])
-def test_a_lost_part_is_made_again(jobs, tmp_path: Path, name: str):
-    outcome = run(jobs(name, tmp_path))
-    expected = contents(tmp_path)
-    kept = [path.stat().st_mtime_ns for path in outcome.paths[1:]]
-    outcome.paths[0].unlink()
-    assert run(jobs(name, tmp_path)).written == [outcome.paths[0]]
-    assert contents(tmp_path) == expected
-    assert [path.stat().st_mtime_ns for path in outcome.paths[1:]] == kept
+def test_a_lost_part_is_made_again(jobs, whole, tmp_path: Path, name: str):
+    folder = whole(name)[0].job.folder
+    lost, *others = sorted(shutil.copytree(folder, tmp_path / "out").rglob("*.h5"))
+    kept = [path.stat().st_mtime_ns for path in others]
+    lost.unlink()
+    assert run(jobs(name, tmp_path / "out")).written == [lost]
+    assert contents(tmp_path / "out") == contents(folder)
+    assert [path.stat().st_mtime_ns for path in others] == kept
 
 
 def test_other_rows_are_another_run(jobs, source: Path, tmp_path: Path):

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import yaml
 from matplotlib import image
+from support.places import QUICK
 from support.urdfs import gripper
 
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
-from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.hand_check.check import check_hand, check_objects
@@ -35,15 +36,16 @@ def spoil(jaws: Path, folder: Path, **changes: object) -> str:
     return str(folder)
 
 
-def test_drafted_gripper_holds_all_three(jaws, tmp_path, swift: Pipeline, cache_root):
-    found = check_hand(str(jaws), swift, out=tmp_path, rows=10, device="cpu", workers=1, cache=Cache(cache_root))
+def test_drafted_gripper_holds_all_three(jaws, tmp_path, cache_root):
+    quick = load_pipeline(QUICK)
+    found = check_hand(str(jaws), quick, out=tmp_path, rows=10, device="cpu", workers=1, cache=Cache(cache_root))
     assert [o.name for o in found.objects] == ["sphere", "box", "cylinder"]
     assert [o.rows for o in found.objects] == [10, 10, 10]
     assert all(o.reasons == [] for o in found.objects)
     assert found.hints == []
     assert [(s.name, s.problem) for s in found.spaces] == [("finger_1-finger_2", "")]
     assert found.longest_sequence == 1
-    assert all(list(o.survivors) == list(swift.order) for o in found.objects)
+    assert all(list(o.survivors) == list(quick.order) for o in found.objects)
     assert [p.name for p in found.pictures] == ["hand.png", "palmar.png", "workspace.png", "spaces.png", "grasps.png"]
     for picture in found.pictures:
         assert picture.read_bytes().startswith(b"\x89PNG")

@@ -16,7 +16,10 @@ from lgrasp.engine.run import run as run_job
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.hold.run import METRICS
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.metrics import MetricsJob
+
+ROWS = 15
 
 
 class Watch(Events):
@@ -40,13 +43,14 @@ def add(cache_root):
     return add
 
 
-@pytest.fixture
-def tried(run, swift, tmp_path):
+@pytest.fixture(scope="module")
+def tried(small_job, swift, tmp_path_factory):
     """Shards of grasps that stage hold tried, none left out: rows of two passes."""
     settings = ["hold.draws=2", "bounds.min_hold_probability=0", "bounds.max_unresisted_load=0.5", "search.passes=2"]
     pipeline = load_pipeline("robust-hold").with_settings(settings).model_copy(update={"field": swift.field})
-    run(pipeline=pipeline, rows=60, shard_rows=30, out=tmp_path / "tried")
-    return tmp_path / "tried"
+    out = tmp_path_factory.mktemp("tried")
+    generate(GenerateJob(**small_job | {"pipeline": pipeline, "rows": 2 * ROWS, "shard_rows": ROWS, "out": out}))
+    return out
 
 
 def without(rows: GraspRows) -> GraspRows:
@@ -62,7 +66,7 @@ def test_they_are_those_of_the_stage(tried, add, tmp_path):
     watch = Watch()
     outcome = add(tmp_path / "bare", tmp_path / "out", watch, workers=2)
     assert outcome.job.report(outcome)["metrics"] == list(METRICS)
-    assert watch.seen[-1] == 60
+    assert watch.seen[-1] == 2 * ROWS
     assert watch.seen == sorted(watch.seen)
     assert len(watch.seen) > 1
     assert validate_shard(tmp_path / "out" / "all.h5") == []
@@ -79,7 +83,7 @@ def test_they_are_those_of_the_stage(tried, add, tmp_path):
 def test_with_others_and_again(tried, add, tmp_path):
     watch = Watch()
     add(tried, tmp_path / "out", watch, add=("volume", "hold"), settings=())
-    assert watch.seen.count(30) == 2
+    assert watch.seen.count(ROWS) == 2
     (first, _) = sorted((tmp_path / "out").glob("*.h5"))
     assert {"volume", *METRICS} <= set(read_shard(first).grasps.metrics)
     assert add(tried, tmp_path / "out", add=("volume", "hold"), settings=()).written == []

@@ -48,14 +48,14 @@ def on_cpu(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return found
 
 
-@pytest.fixture
-def cold(tmp_path: Path) -> Cache:
-    """An empty cache: hands and objects are made on the device too."""
-    return Cache(tmp_path / "cache", pytest.fail)
+@pytest.fixture(scope="module")
+def cold(tmp_path_factory: pytest.TempPathFactory) -> Cache:
+    """A cache that is empty at first: hands and objects are made on the device too."""
+    return Cache(tmp_path_factory.mktemp("cache"), pytest.fail)
 
 
 def test_plan(on_cpu, cold, tmp_path):
-    given = {"hand": "barrett", "object": "sphere", "starts": 3}
+    given = {"hand": "barrett", "object": "tiny", "starts": 3}
     outcome = run(PlanJob(**given, out=tmp_path / "out", cache=cold))
     assert outcome.rows
     assert on_cpu == []
@@ -63,8 +63,8 @@ def test_plan(on_cpu, cold, tmp_path):
 
 def test_scenes(on_cpu, cold, tmp_path):
     small = {"objects": 1, "camera": {"width": 40, "height": 30, "views": 1}}
-    given = {"objects": ["tiny"], "pipeline": QUICK, "stock": 3, "scenes": 1, "workers": 1, "scene": small}
-    made = run(SceneJob(**given, out=tmp_path / "out", cache=cold))
+    given = {"hand": "barrett", "objects": ["tiny"], "pipeline": QUICK, "stock": 3, "scenes": 1, "scene": small}
+    made = run(SceneJob(**given, out=tmp_path / "out", workers=1, cache=cold))
     assert len(made.written) == 1
     assert on_cpu == []
 

@@ -17,7 +17,6 @@ from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run
 from lgrasp.errors import ShardError
@@ -37,23 +36,10 @@ SPOILT = np.arange(ROWS) % 2 == 0
 
 
 @pytest.fixture(scope="module")
-def source(swift: Pipeline, cache_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def source(small_job: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A shard of 40 valid grasps of which every second hand was moved by millimetres, with verdicts of a simulator."""
     folder = tmp_path_factory.mktemp("source")
-    made = generate(
-        GenerateJob(
-            hand="allegro",
-            object="mug",
-            rows=ROWS,
-            pipeline=swift,
-            out=folder / "made",
-            shard_rows=ROWS,
-            device="cpu",
-            workers=1,
-            batch=128,
-            cache=Cache(cache_root, pytest.fail),
-        )
-    )
+    made = generate(GenerateJob(**small_job | {"rows": ROWS, "shard_rows": ROWS, "out": folder / "made"}))
     shard = read_shard(made.paths[0])
     rows = replace(
         spoil(shard.grasps, shard),
@@ -225,7 +211,8 @@ def test_regions_are_not_claimed_of_refined_rows(source, refine, tmp_path):
     shard = read_shard(source)
     asked = replace(shard.objects[0], regions=np.ones((9, 5), "f4"), touch_share=0.5)
     write_shard(tmp_path / "steered.h5", replace(shard, objects=[asked]))
-    (object_,) = read_shard(refine(tmp_path / "steered.h5", tmp_path / "out")).objects
+    still = RefineParams(matching_rounds=0)
+    (object_,) = read_shard(refine(tmp_path / "steered.h5", tmp_path / "out", params=still)).objects
     assert (object_.regions, object_.touch_share) == (None, 1.0)
 
 
@@ -262,16 +249,14 @@ def test_shards_without_rows_are_left_out(source, cache_root, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_shard_of_which_no_row_passes_is_empty_and_stays(swift, cache_root, tmp_path):
+def test_a_shard_of_which_no_row_passes_is_empty_and_stays(job, cache_root, tmp_path):
     """It conforms to the format, and is not computed again."""
-    cache = Cache(cache_root)
-    job = {"hand": "allegro", "object": "sphere", "rows": 8, "shard_rows": 4, "pipeline": swift, "device": "cpu"}
-    last = generate(GenerateJob(**job, out=tmp_path / "made", workers=1, batch=128, cache=cache)).paths[1]
+    last = generate(job(object="sphere", rows=8, shard_rows=4, out=tmp_path / "made")).paths[1]
     shard = read_shard(last)
     pose = shard.grasps.object_pose + np.array([0.1, 0, 0, 0, 0, 0, 0], np.float32)
     write_shard(last, replace(shard, grasps=replace(shard.grasps, object_pose=pose)))
     params, out = RefineParams(matching_rounds=0), tmp_path / "out"
-    given: dict[str, Any] = {"device": "cpu", "cache": cache}
+    given: dict[str, Any] = {"device": "cpu", "cache": Cache(cache_root)}
     refined = RefineJob(shards=(tmp_path / "made",), out=out, params=params, **given)
     first = run(refined)
     assert [part.rows for part, _ in first.made_parts] == [4, 4]
@@ -289,11 +274,10 @@ def test_a_shard_of_which_no_row_passes_is_empty_and_stays(swift, cache_root, tm
 
 
 @pytest.mark.parametrize(("name", "share"), [("sphere", 0.85), ("mug", 0.7)])
-def test_grasps_shaken_by_millimetres_are_recovered(swift, cache_root, refine, tmp_path, name, share):
+def test_grasps_shaken_by_millimetres_are_recovered(job, refine, tmp_path, name, share):
     """The object off by 4 mm an axis: most are valid again, and no invalid row is written."""
-    rows, cache = 60, Cache(cache_root)
-    job = {"hand": "allegro", "object": name, "rows": rows, "pipeline": swift, "device": "cpu", "workers": 1}
-    made = generate(GenerateJob(**job, out=tmp_path / "made", cache=cache))
+    rows = 30
+    made = generate(job(object=name, rows=rows, shard_rows=rows, out=tmp_path / "made"))
     shard = read_shard(made.paths[0])
     pose = shard.grasps.object_pose.copy()
     pose[:, 0, :3] += 0.004 * np.random.default_rng(0).normal(size=(len(pose), 3))

@@ -40,10 +40,9 @@ def warnings_of(cache_root):
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(swift, cache_root, tmp_path_factory):
+def uninterrupted(small_job, tmp_path_factory):
     folder = tmp_path_factory.mktemp("uninterrupted")
-    cache = Cache(cache_root)
-    generate(GenerateJob(object="mug", rows=80, pipeline=swift, out=folder, shard_rows=20, device="cpu", cache=cache))
+    generate(GenerateJob(**small_job | {"rows": 80, "workers": 0, "batch": 0, "out": folder}))
     return folder
 
 

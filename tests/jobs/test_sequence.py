@@ -244,7 +244,7 @@ def test_stop(job):
 def test_physics_between_steps(pipeline, inputs, job):
     """Rows that do not hold are not gone on from: every row of the file holds, and so do those before it."""
     pytest.importorskip("mujoco")
-    outcome = run(job(rows=4, simulate="seq6"))
+    outcome = run(job(objects=("sphere", "sphere"), rows=4, simulate="seq6"))
     rows = read_shard(outcome.paths[0]).grasps
     assert rows.physics["seq6_holds"].all()
     assert rows.physics["seq6_object_touches"].shape == rows.object_index.shape

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, named_object, object_of_shard
+from lgrasp.planning.params import PlanParams
 from lgrasp.runtime.device import resolve_device
 
 CPU = resolve_device("cpu")
@@ -127,9 +129,8 @@ def test_rules_that_fit_nothing_are_an_error(made: Path, cache_root: Path):
 
 def test_plans_take_hand_and_object_from_a_shard(made: Path, cache_root: Path, tmp_path: Path):
     cache = Cache(cache_root, pytest.fail)
-    (path,) = run(
-        PlanJob(hand=str(made), object=str(made), out=tmp_path / "plans", starts=12, device="cpu", cache=cache)
-    ).paths
+    few: dict[str, Any] = {"starts": 2, "params": PlanParams(rolls=8, finalists=2), "device": "cpu"}
+    (path,) = run(PlanJob(hand=str(made), object=str(made), out=tmp_path / "plans", cache=cache, **few)).paths
     plan, shard = read_shard(path), read_shard(made)
     assert plan.hand == replace(shard.hand, joint_lower=plan.hand.joint_lower, joint_upper=plan.hand.joint_upper)
     np.testing.assert_array_equal(plan.objects[0].faces, shard.objects[0].faces)

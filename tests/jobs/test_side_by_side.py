@@ -12,8 +12,9 @@ from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run as run_job
 from lgrasp.errors import DeviceError
-from lgrasp.jobs.generate import GenerateJob
+from lgrasp.jobs.generate import GenerateJob, generate
 
+ROWS = 120
 _COUNTED = ("grasps", "strict", "distinct_poses", "published_count", "force_closure", "counts", "near_duplicates")
 
 
@@ -30,16 +31,17 @@ def side_by_side(monkeypatch):
     monkeypatch.setattr("lgrasp.jobs.generate.cores", lambda: 2)
 
 
-@pytest.fixture
-def plain(run, tmp_path):
-    return run(out=tmp_path / "plain", rows=120)
+@pytest.fixture(scope="module")
+def plain(small_job, tmp_path_factory):
+    """The same job, one shard at a time."""
+    return generate(GenerateJob(**small_job | {"rows": ROWS, "out": tmp_path_factory.mktemp("plain")}))
 
 
 def test_rows_and_report_are_those_of_one_at_a_time(plain, side_by_side, run, grasps, tmp_path):
-    outcome = run(rows=120)
+    outcome = run(rows=ROWS)
     assert outcome.job.at_once() > 1
     assert outcome.job.writers() == 2
-    expected = grasps(tmp_path / "plain")
+    expected = grasps(plain.job.out)
     for name, values in grasps(tmp_path / "out").items():
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
     told, before = job_report(outcome), job_report(plain)
@@ -48,14 +50,14 @@ def test_rows_and_report_are_those_of_one_at_a_time(plain, side_by_side, run, gr
 
 
 def test_stopped_it_leaves_whole_shards_and_goes_on(plain, side_by_side, job, grasps, tmp_path):
-    outcome = run_job(job(rows=120), StopAfter(2))
+    outcome = run_job(job(rows=ROWS), StopAfter(2))
     assert outcome.cancelled
     assert not multiprocessing.active_children()
     paths = sorted((tmp_path / "out").glob("*.h5"))
     assert 0 < len(paths) < 6
     assert [validate_shard(path) for path in paths] == [[]] * len(paths)
-    run_job(job(rows=120))
-    expected = grasps(tmp_path / "plain")
+    run_job(job(rows=ROWS))
+    expected = grasps(plain.job.out)
     for name, values in grasps(tmp_path / "out").items():
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
 

@@ -27,11 +27,10 @@ from lgrasp.stages.refine.params import RefineParams
 
 
 @pytest.fixture(scope="module")
-def on_table(swift, cache_root, tmp_path_factory):
+def on_table(swift, small_job, tmp_path_factory):
     """A shard of grasps on a table, and what the job reports of it."""
-    given = {"object": "mug", "rows": 30, "shard_rows": 30, "device": "cpu", "workers": 1, "batch": 128}
-    out, cache = tmp_path_factory.mktemp("table"), Cache(cache_root, pytest.fail)
-    outcome = generate(GenerateJob(**given, pipeline=swift.with_table(), out=out, cache=cache))
+    changes = {"rows": 30, "shard_rows": 30, "pipeline": swift.with_table(), "out": tmp_path_factory.mktemp("table")}
+    outcome = generate(GenerateJob(**small_job | changes))
     (path,) = outcome.paths
     return path, outcome.job.report(outcome)
 
