@@ -15,7 +15,7 @@ def test_locked_joints_are_in_the_shard(cache_root, tmp_path):
     name = "shadow"
     pipeline = load_pipeline("swift").model_copy(update={"field": FieldParams(records=20_000, index="bvh")})
     given = {"pipeline": pipeline, "out": tmp_path / "out", "cache": Cache(cache_root)}
-    outcome = generate(GenerateJob(hand=name, object="sphere", rows=30, **given))
+    outcome = generate(GenerateJob(hand=name, object="sphere", rows=10, **given))
     shard = read_shard(outcome.paths[0])
     names = list(shard.hand.joint_names)
     locked = find_hand(name).spec.locked

@@ -10,7 +10,7 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.errors import ConfigError
 from lgrasp.judge.run import judge
 
-ROWS = 20
+ROWS = 10
 HANDLE = "box:0.026,-1,-1:1,1,1"
 TOP, LOW = "box:-1,-1,0.06:1,1,1", "box:-1,-1,-1:1,1,0.06"
 
@@ -64,8 +64,8 @@ def test_no_contact_is_on_what_is_avoided(steered):
 
 def test_a_handle_is_found(steered):
     """Contacts are drawn on it, not filtered: a candidate gives at least 30 % of the handle's part in the grasps."""
-    handle, path = steered(touch=HANDLE)
-    whole, _ = steered()
+    handle, path = steered(rows=20, touch=HANDLE)
+    whole, _ = steered(rows=20)
     mesh = trimesh.Trimesh(whole.objects[0].vertices, whole.objects[0].faces)
     surface = mesh.area_faces[mesh.triangles_center[:, 0] >= 0.026].sum() / mesh.area
     assert 0.05 < surface < 0.15

@@ -10,12 +10,14 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.places import QUICK
 from support.resumed import Child
 
 from lgrasp.dataset.manifest import compare, read_manifest, workers
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
+from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.jobs.generate import GenerateJob, generate
 
@@ -52,24 +54,23 @@ def whole(uninterrupted, tmp_path):
     return Path(shutil.copytree(uninterrupted, tmp_path / "whole"))
 
 
-def test_deleted_shards_are_made_again(run, whole, raw_grasps, tmp_path):
-    out = run(rows=80).paths[0].parent
-    kept = sorted(out.glob("*.h5"))
+def test_deleted_shards_are_made_again(run, whole, raw_grasps):
+    expected = raw_grasps(whole)
+    kept = sorted(whole.glob("*.h5"))
     before = kept[1].stat().st_mtime_ns
     for shard in (0, 2):
         kept[shard].unlink()
-    outcome = run(rows=80)
+    outcome = run(rows=80, out=whole)
     assert (outcome.rows, outcome.made, outcome.present) == (80, 40, 40)
     assert [p.name for p in outcome.written] == [kept[0].name, kept[2].name]
     assert kept[1].stat().st_mtime_ns == before
-    assert raw_grasps(out) == raw_grasps(whole)
+    assert raw_grasps(whole) == expected
 
 
-def test_nothing_to_do(run, raw_grasps):
-    first = run(rows=40)
-    again = run(rows=40)
-    assert (again.made, again.present, again.rows) == (0, 40, 40)
-    assert again.paths == first.paths
+def test_nothing_to_do(run, whole):
+    again = run(rows=80, out=whole)
+    assert (again.made, again.present, again.rows) == (0, 80, 80)
+    assert sorted(again.paths) == sorted(whole.glob("*.h5"))
     assert not again.written
 
 
@@ -83,10 +84,10 @@ def test_more_rows_later(run, whole, raw_grasps, tmp_path):
 
 def test_fewer_rows_later(run, raw_grasps, tmp_path):
     """Rows on disk are not thrown away when fewer are asked."""
-    run(rows=50)
+    run(rows=30)
     before = raw_grasps(tmp_path / "out")
-    outcome = run(rows=45)
-    assert (outcome.made, outcome.rows, outcome.starved) == (0, 50, False)
+    outcome = run(rows=25)
+    assert (outcome.made, outcome.rows, outcome.starved) == (0, 30, False)
     assert raw_grasps(tmp_path / "out") == before
 
 
@@ -150,31 +151,38 @@ def test_other_objects_may_share_a_folder(run, tmp_path):
 class TestStarving:
     """Bounded effort: what is found is kept, and history does not matter."""
 
-    @pytest.fixture(autouse=True)
-    def _short_effort(self, monkeypatch):
-        monkeypatch.setattr(shard_module, "_LEAST_EFFORT", 1024)
+    @pytest.fixture(scope="class", autouse=True)
+    def _short_effort(self):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(shard_module, "_LEAST_EFFORT", 1024)
+            yield
 
-    @pytest.fixture
+    @pytest.fixture(scope="class")
     def poor(self, swift):
         return swift.model_copy(update={"effort": 1, "patience": 1})
+
+    @pytest.fixture(scope="class")
+    def starved(self, small_job, poor, tmp_path_factory):
+        """A run of two shards that gave up."""
+        asked = {"rows": 2000, "shard_rows": 1000, "pipeline": poor, "out": tmp_path_factory.mktemp("starved")}
+        return generate(GenerateJob(**small_job | asked))
 
     @pytest.fixture
     def hopeless(self, swift):
         return swift.with_params("search", least_force=0.5).model_copy(update={"effort": 1, "patience": 1})
 
-    def test_starved_shards_are_present(self, run, poor, raw_grasps, tmp_path):
-        first = run(rows=2000, shard_rows=1000, pipeline=poor)
-        assert first.starved
-        assert len(first.paths) == 2
-        assert 0 < first.made < 2000
-        assert all(r.exhausted and r.candidates == 1024 for r in first.results)
-        before = raw_grasps(tmp_path / "out")
+    def test_starved_shards_are_present(self, run, starved, poor, raw_grasps, tmp_path):
+        assert starved.starved
+        assert len(starved.paths) == 2
+        assert 0 < starved.made < 2000
+        assert all(r.exhausted and r.candidates == 1024 for r in starved.results)
+        shutil.copytree(starved.job.out, tmp_path / "out")
         again = run(rows=2000, shard_rows=1000, pipeline=poor)
-        assert (again.made, again.rows, again.starved) == (0, first.made, True)
-        first.paths[1].unlink()
+        assert (again.made, again.rows, again.starved) == (0, starved.made, True)
+        again.paths[1].unlink()
         again = run(rows=2000, shard_rows=1000, pipeline=poor)
         assert 0 < again.made < 1000
-        assert raw_grasps(tmp_path / "out") == before
+        assert raw_grasps(tmp_path / "out") == raw_grasps(starved.job.out)
 
     def test_more_effort_when_more_is_asked(self, run, poor, tmp_path):
         """A last shard that gave up early goes on when n, and with it the effort, grows."""
@@ -185,18 +193,11 @@ class TestStarving:
         assert more.results[0].candidates == 4096
         assert more.rows > first.rows
 
-    def test_array_tasks_find_the_same(self, run, poor, raw_grasps, tmp_path):
-        run(rows=3000, shard_rows=1000, pipeline=poor, out=tmp_path / "single")
-        for task in range(3):
-            run(
-                rows=3000,
-                shard_rows=1000,
-                pipeline=poor,
-                out=tmp_path / "array",
-                array=(task, 3),
-            )
-        assert len(raw_grasps(tmp_path / "single")) == 3
-        assert raw_grasps(tmp_path / "single") == raw_grasps(tmp_path / "array")
+    def test_array_tasks_find_the_same(self, run, starved, poor, raw_grasps, tmp_path):
+        for task in range(2):
+            run(rows=2000, shard_rows=1000, pipeline=poor, array=(task, 2))
+        assert len(raw_grasps(starved.job.out)) == 2
+        assert raw_grasps(starved.job.out) == raw_grasps(tmp_path / "out")
 
     def test_an_empty_shard_ends_the_run(self, run, hopeless, tmp_path):
         first = run(rows=3000, shard_rows=1000, pipeline=hopeless)
@@ -271,8 +272,11 @@ def test_killed_while_writing(whole, raw_grasps, job, cache_root, tmp_path):
     assert listed(out) == listed(whole)
 
 
-def test_processes_share_an_empty_cache(whole, raw_grasps, tmp_path):
+def test_processes_share_a_cache(inputs, whole, raw_grasps, cache_root, tmp_path):
+    """That has nothing but the hand."""
     out, cache = tmp_path / "array", tmp_path / "cache"
+    (cache / "hand").mkdir(parents=True)
+    shutil.copy(Cache(cache_root).path("hand", inputs.keys.hand), cache / "hand")
     children = [Child(out, cache, 80, task=(task, 2)) for task in range(2)]
     assert [child.finish() for child in children] == [0, 0]
     assert raw_grasps(out) == raw_grasps(whole)
@@ -349,7 +353,7 @@ def test_long_names(run, tmp_path):
 
     mesh = tmp_path / f"{'x' * 240}.obj"
     mesh.write_bytes(find_object("sphere").read_bytes())
-    assert run(rows=20, object=str(mesh)).paths[0].is_file()
+    assert run(rows=20, object=str(mesh), pipeline=load_pipeline(QUICK)).paths[0].is_file()
 
 
 def test_memory_does_not_grow_with_the_shards(job):
@@ -363,7 +367,7 @@ def test_memory_does_not_grow_with_the_shards(job):
             self.alive.append(sum(table() is not None for table in self.tables))
 
     watch = Watch()
-    outcome = generate(job(rows=100), watch)
-    assert outcome.rows == 100
-    assert watch.alive == [1] * 5
+    outcome = generate(job(rows=60), watch)
+    assert outcome.rows == 60
+    assert watch.alive == [1] * 3
     assert sum(len(r.grasps) for r in outcome.results) == 0

@@ -90,6 +90,7 @@ def test_a_second_run_makes_only_what_is_missing(several, inputs, cache, calls):
     assert calls == made
     third = make_shard(several, inputs, 0, 600, Execution(1, 1024), bank_cache=cache)
     assert third.candidates > second.candidates == first.candidates
+    assert third.duplicates > 0  # which are left out
     pose = user_poses(third.grasps.pose, inputs.object.model.center)
     assert len(near_pairs(pose, third.grasps.q)) == 0
     rows = rows_of(third.grasps)
@@ -152,20 +153,12 @@ def test_later_passes_add_new_rows_best_poses_first(swift, context):
 @pytest.fixture(scope="module")
 def plain(several, inputs):
     """Rows of several passes, which nothing was to go on from."""
-    return make_shard(several, inputs, 0, 300, Execution(1)).grasps
+    return make_shard(several, inputs, 0, 100, Execution(1)).grasps
 
 
-@pytest.mark.parametrize(("workers", "batch"), [(1, 1), (2, 300), (2, 1024)])
+@pytest.mark.parametrize(("workers", "batch"), [(1, 1), (2, 100), (2, 512)])
 def test_passes_do_not_depend_on_the_batches(several, inputs, plain, workers, batch):
-    assert_same(plain, make_shard(several, inputs, 0, 300, Execution(workers, batch)).grasps)
-
-
-def test_passes_leave_no_near_duplicates(several, inputs):
-    result = make_shard(several, inputs, 0, 1500, Execution(2))
-    assert len(result.grasps) == 1500
-    written = user_poses(result.grasps.pose, inputs.object.model.center)
-    assert len(near_pairs(written, result.grasps.q)) == 0
-    assert result.duplicates > 0
+    assert_same(plain, make_shard(several, inputs, 0, 100, Execution(workers, batch)).grasps)
 
 
 def test_passes_over_nothing(swift, context):
@@ -183,13 +176,13 @@ def test_how_many_passes(swift, several):
 @pytest.mark.parametrize("passes", [1, PASSES])
 def test_a_folder_that_grows(run, swift, grasps, calls, tmp_path, passes):
     """Twice with more rows asked, and once: the same file; rows that were there stay, and are not made again."""
-    common = {"pipeline": swift.with_passes(passes), "shard_rows": 10_000, "batch": 512}
-    run(rows=100, out=tmp_path / "a", **common)
+    common = {"pipeline": swift.with_passes(passes), "shard_rows": 10_000, "batch": 256}
+    run(rows=50, out=tmp_path / "a", **common)
     few = grasps(tmp_path / "a")["q"]
     before = calls["place"]
-    run(rows=300, out=tmp_path / "a", **common)
+    run(rows=150, out=tmp_path / "a", **common)
     grown = calls["place"] - before
-    run(rows=300, out=tmp_path / "b", **common)
+    run(rows=150, out=tmp_path / "b", **common)
     assert grown < calls["place"] - before - grown
     twice, once = grasps(tmp_path / "a"), grasps(tmp_path / "b")
     assert twice.keys() == once.keys()
@@ -201,9 +194,9 @@ def test_a_folder_that_grows(run, swift, grasps, calls, tmp_path, passes):
 def test_a_new_folder_is_computed(run, swift, calls, tmp_path):
     """What was cached of a shard serves only to complete it: a run that is timed works."""
     common = {"pipeline": swift, "shard_rows": 10_000}
-    run(rows=50, out=tmp_path / "a", **common)
+    run(rows=20, out=tmp_path / "a", **common)
     first = calls["place"]
-    run(rows=50, out=tmp_path / "b", **common)
+    run(rows=20, out=tmp_path / "b", **common)
     second = calls["place"]
-    run(rows=50, out=tmp_path / "a", resume=False, **common)
+    run(rows=20, out=tmp_path / "a", resume=False, **common)
     assert 0 < first < second < calls["place"]

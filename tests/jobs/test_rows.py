@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.places import QUICK
 
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
+from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.judge.run import judge
 from lgrasp.object.find import find_object
 
@@ -16,9 +19,9 @@ from lgrasp.object.find import find_object
 @pytest.mark.parametrize("name", ["mug", "box", "sphere"])
 def test_strictly_valid(run, name):
     """An independent judge finds every row valid and agrees with the stored numbers."""
-    (path,) = run(object=name, rows=60, shard_rows=60).paths
+    (path,) = run(object=name, rows=30, shard_rows=30).paths
     report = judge(path, mesh=find_object(name))
-    assert report.rows == 60
+    assert report.rows == 30
     assert report.valid_share == 1.0, report
     assert report.repeats.largest == 0
     bounds = {
@@ -33,9 +36,10 @@ def test_strictly_valid(run, name):
         assert report.metrics[key]["max"] < bound, key
 
 
-@pytest.fixture
-def rows(run, swift, inputs):
-    (path,) = run(rows=40, shard_rows=40).paths
+@pytest.fixture(scope="module")
+def rows(small_job, swift, inputs, tmp_path_factory):
+    changes = {"rows": 40, "shard_rows": 40, "out": tmp_path_factory.mktemp("rows")}
+    (path,) = generate(GenerateJob(**small_job | changes)).paths
     return path, read_shard(path), make_shard(swift, inputs, 0, 40, Execution()).grasps
 
 
@@ -102,12 +106,13 @@ def _solid_distance(geometry, p: np.ndarray) -> float:
 
 def test_scaled_object(run, tmp_path):
     """A mesh in other units, scaled, gives the poses of the original."""
-    mesh = trimesh.load_mesh(find_object("mug"))
+    mesh = trimesh.load_mesh(find_object("tiny"))
     mesh.apply_scale(4.0)
-    path = tmp_path / "mug.obj"
+    path = tmp_path / "tiny.obj"
     mesh.export(path)
-    (small,) = run(object="mug", rows=20, out=tmp_path / "a").paths
-    (large,) = run(object=str(path), scale=0.25, rows=20, out=tmp_path / "b").paths
+    asked = {"rows": 20, "pipeline": load_pipeline(QUICK)}
+    (small,) = run(object="tiny", out=tmp_path / "a", **asked).paths
+    (large,) = run(object=str(path), scale=0.25, out=tmp_path / "b", **asked).paths
     a, b = read_shard(small), read_shard(large)
     np.testing.assert_allclose(a.objects[0].vertices, b.objects[0].vertices, atol=1e-6)
     assert b.objects[0].scale == 0.25

@@ -1,7 +1,6 @@
 """Grasps that obey what is asked of them, told from the rows alone."""
 
 import json
-import shutil
 from typing import Any
 
 import h5py
@@ -18,7 +17,7 @@ from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.geometry.poses import device_matrix, pose_matrix
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.config import JobConfig, plan_requests
-from lgrasp.jobs.generate import generate
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.judge.run import judge
@@ -95,7 +94,7 @@ def thumb_angles(shard, link_poses):
 @pytest.mark.parametrize("asked", [{"thumb": "adducted"}, {"thumb": "abducted"}, {"grasp_type": "adduction-grip"}])
 def test_the_thumb_is_where_it_is_asked_to_be(steered, link_poses, tmp_path, asked):
     """Also where it does not touch, as in an adduction grip; the judge agrees, and finds rows with another thumb."""
-    shard = steered(rows=12, **asked)
+    shard = steered(rows=6, **asked)
     angles, adducted = thumb_angles(shard, link_poses), asked.get("thumb") == "adducted"
     middle = shard.header.config["steered"]["thumb"]["angle"]
     assert 45 < middle < 55  # its range is 15 to 86
@@ -121,7 +120,7 @@ def test_fingers_of_the_published_index(lightning, load):
     """Contacts of the boxes obey as those of the voxels do."""
     pipeline = lightning.with_steering(fingers="index,thumb")
     inputs = load(pipeline=pipeline)
-    sets = run_stages(pipeline, shard_context(pipeline, inputs, 0), 0, 2000, "search").arrays()
+    sets = run_stages(pipeline, shard_context(pipeline, inputs, 0), 0, 500, "search").arrays()
     assert len(sets["chosen"]) > 0
     tree = inputs.hand.model.tree
     groups = [tree.group_of(FINGERS[name][-1]) for name in ("index", "thumb")]
@@ -173,7 +172,7 @@ def test_the_hand_stays_above_the_plane(steered, solids, link_poses):
 
 
 def test_the_judge_agrees_and_finds_rows_that_do_not_obey(steered, tmp_path):
-    steered(rows=10, fingers="thumb,index,middle", palm="no", approach="1,0,0:40", above="0,0,1,0.001")
+    steered(rows=4, fingers="thumb,index,middle", palm="no", approach="1,0,0:40", above="0,0,1,0.001")
     (path,) = (tmp_path / "steered").glob("*.h5")
     assert judge(path).valid_share == 1.0
     with h5py.File(path) as file:
@@ -202,9 +201,16 @@ def test_refined_rows_are_free_but_stay_above_the_plane(steered, cache_root, tmp
     assert not any(failed[check].any() for check in ("steered", "table", "resting"))
 
 
+@pytest.fixture(scope="module")
+def unsteered(small_job, tmp_path_factory):
+    """A shard of grasps of which nothing is asked."""
+    (path,) = generate(GenerateJob(**small_job | {"rows": 20, "out": tmp_path_factory.mktemp("unsteered")})).paths
+    return path
+
+
 @pytest.mark.parametrize("kind", [".npz", ".csv", ".h5"])
-def test_the_object_is_where_the_file_says(steered, run, swift, tmp_path, kind):
-    (path,) = run(rows=20).paths[:1]
+def test_the_object_is_where_the_file_says(steered, unsteered, tmp_path, kind):
+    path = unsteered
     poses = np.unique(read_shard(path).grasps.object_pose[:, 0].astype(float), axis=0)  # some have several rows
     if kind != ".h5":
         path = tmp_path / f"poses{kind}"
@@ -234,10 +240,9 @@ def obeys_only_its_poses(path):
     np.testing.assert_array_equal(judge(path).failed["steered"], mine)
 
 
-def test_poses_of_the_hand(steered, tmp_path):
-    T = pose_matrix(steered(rows=10).grasps.object_pose[:, 0].astype(float))
+def test_poses_of_the_hand(steered, unsteered, tmp_path):
+    T = pose_matrix(read_shard(unsteered).grasps.object_pose[:, 0].astype(float))
     np.savez(tmp_path / "hand.npz", T_object_hand=np.linalg.inv(T))
-    shutil.rmtree(tmp_path / "steered")
     found = pose_matrix(steered(pose=tmp_path / "hand.npz", rows=5).grasps.object_pose[:, 0].astype(float))
     assert np.abs(found[:, None] - T[None]).max((2, 3)).min(1).max() < 1e-5
 

@@ -29,7 +29,7 @@ from lgrasp.stages.refine.params import RefineParams
 @pytest.fixture(scope="module")
 def on_table(swift, small_job, tmp_path_factory):
     """A shard of grasps on a table, and what the job reports of it."""
-    changes = {"rows": 30, "shard_rows": 30, "pipeline": swift.with_table(), "out": tmp_path_factory.mktemp("table")}
+    changes = {"rows": 16, "shard_rows": 16, "pipeline": swift.with_table(), "out": tmp_path_factory.mktemp("table")}
     outcome = generate(GenerateJob(**small_job | changes))
     (path,) = outcome.paths
     return path, outcome.job.report(outcome)
@@ -143,11 +143,11 @@ def test_asked_for_or_not(run, job, swift):
 
 def test_same_rows_however_they_are_made(run, swift, grasps, tmp_path):
     """In other batches, by more workers, or continued from fewer rows."""
-    table = {"pipeline": swift.with_table(), "shard_rows": 60}
-    run(**table, rows=60, out=tmp_path / "whole")
-    run(**table, rows=60, out=tmp_path / "cut", batch=300, workers=2)
+    table = {"pipeline": swift.with_table(), "shard_rows": 40}
+    run(**table, rows=40, out=tmp_path / "whole")
+    run(**table, rows=40, out=tmp_path / "cut", batch=300, workers=2)
     run(**table, rows=20, out=tmp_path / "grown")
-    run(**table, rows=60, out=tmp_path / "grown")
+    run(**table, rows=40, out=tmp_path / "grown")
     whole = grasps(tmp_path / "whole")
     for name in ("cut", "grown"):
         other = grasps(tmp_path / name)
