@@ -152,17 +152,20 @@ class TestStarving:
     """Bounded effort: what is found is kept, and history does not matter."""
 
     @pytest.fixture(scope="class", autouse=True)
-    def _short_effort(self):
+    @classmethod
+    def _short_effort(cls):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(shard_module, "_LEAST_EFFORT", 1024)
             yield
 
     @pytest.fixture(scope="class")
-    def poor(self, swift):
+    @classmethod
+    def poor(cls, swift):
         return swift.model_copy(update={"effort": 1, "patience": 1})
 
     @pytest.fixture(scope="class")
-    def starved(self, small_job, poor, tmp_path_factory):
+    @classmethod
+    def starved(cls, small_job, poor, tmp_path_factory):
         """A run of two shards that gave up."""
         asked = {"rows": 2000, "shard_rows": 1000, "pipeline": poor, "out": tmp_path_factory.mktemp("starved")}
         return generate(GenerateJob(**small_job | asked))
