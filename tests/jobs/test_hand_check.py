@@ -93,13 +93,16 @@ def test_box_out_of_reach_is_named(jaws, tmp_path, swift, cache_root):
     assert diagnose(inputs, counts, rows=10, asked=10) == []
 
 
-def test_surfaces_that_never_face_are_named(jaws, tmp_path, swift, cache_root):
+def test_surfaces_that_never_face_and_a_box_inside_the_palm_are_named(jaws, tmp_path, swift, cache_root):
     outside = [
         {"links": ["jaw_l"], "forbidden": [{"axis": [-1, 0, 0], "angle": 120}]},
         {"links": ["jaw_r"], "forbidden": [{"axis": [1, 0, 0], "angle": 120}]},
     ]
-    hand = spoil(jaws, tmp_path, contact=outside, palm={})
-    assert any("never face each other" in line for line in load_findings(hand, swift, cache_root)["search"])
+    inside = {"min": [-0.04, -0.02, -0.02], "max": [0.04, 0.02, 0.02]}
+    hand = spoil(jaws, tmp_path, contact=outside, palm={}, canonical_box=inside)
+    found = load_findings(hand, swift, cache_root)
+    assert any("never face each other" in line for line in found["search"])
+    assert any("inside static links" in line for line in found["place"])
 
 
 def test_jaws_that_open_too_little_are_named(jaws, tmp_path, swift, cache_root):
@@ -108,11 +111,6 @@ def test_jaws_that_open_too_little_are_named(jaws, tmp_path, swift, cache_root):
     urdf.write_text(urdf.read_text().replace('upper="0.05"', 'upper="0.02"'))
     (line,) = load_findings(hand, swift, cache_root)["search"]
     assert "face each other they are at most 4" in line  # 40 mm, along the surfaces a little more
-
-
-def test_box_inside_the_palm_is_named(jaws, tmp_path, swift, cache_root):
-    hand = spoil(jaws, tmp_path, canonical_box={"min": [-0.04, -0.02, -0.02], "max": [0.04, 0.02, 0.02]})
-    assert any("inside static links" in line for line in load_findings(hand, swift, cache_root)["place"])
 
 
 def test_field_vectors_are_contacts_of_the_finger(inputs: Inputs):
