@@ -85,7 +85,7 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
 
 @pytest.fixture(scope="module")
 def plan(inputs) -> Callable[..., Planned]:
-    """plan(tried, draws): what is planned of 10 starts; the first hand always holds at the sixth, another at the ninth."""
+    """plan(tried, draws): what is planned of 10 starts; of the ninth the first hand does not hold, and another does."""
 
     @cache
     def plan(tried: int, draws: int = 0) -> Planned:
