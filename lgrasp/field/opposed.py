@@ -35,7 +35,7 @@ def opposed_pairs(
         drawn = np.stack([rng.integers(len(x["position"]), size=_PAIRS_DRAWN // len(both)) for x in (p, q)], 1)
         for rows in np.split(drawn.astype(np.int32), range(_PAIRS_AT_ONCE, len(drawn), _PAIRS_AT_ONCE)):
             i, j = rows.T
-            ends = (part[name].take(at, 0) for part, at in ((p, i), (q, j)) for name in ("position", "direction"))
+            ends = [part[name].take(k, 0) for part, k in ((p, i), (q, j)) for name in ("position", "direction")]
             good, width = opposed(*ends, still=b < 0)
             found.append(np.insert(rows[good], 0, number, axis=1))
             widths.append(width[good].astype(np.float32))

@@ -49,11 +49,13 @@ def box_grid(
     shape = np.ceil((high - low) / cell).astype(int) + 1
     axes = [low[a] + cell * np.arange(shape[a]) for a in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = signed_distance(meshes[0], points, device, **sign)
-    for mesh in meshes[1:]:
-        near = np.flatnonzero(_box_distance(mesh, points) <= values + _ROUNDING)  # no other can be nearer
-        values[near] = np.minimum(values[near], signed_distance(mesh, points[near], device, **sign))
-    return SdfGrid(values.reshape(shape).astype(np.float32), low.astype(np.float32), cell)
+    boxes, values = np.stack([_box_distance(mesh, points) for mesh in meshes]), np.full(len(points), np.inf, np.float32)
+    nearest = boxes.argmin(0)
+    for own in (True, False):  # of each point first the solid of the nearest box, then those that may be nearer
+        for number, mesh in enumerate(meshes):
+            rows = np.flatnonzero(((nearest == number) == own) & (boxes[number] <= values + _ROUNDING))
+            values[rows] = np.minimum(values[rows], signed_distance(mesh, points[rows], device, **sign))
+    return SdfGrid(values.reshape(shape), low.astype(np.float32), cell)
 
 
 def in_cone(normals: np.ndarray, cone: Cone) -> np.ndarray:
@@ -153,7 +155,8 @@ def _free(
 def _box_distance(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     """(n,) [m]: no point (n, 3) is nearer than this to a mesh, by the box around it; negative inside the box."""
     low, high = mesh.bounds
-    return np.maximum(low - points, points - high).max(1)
+    x, y, z = np.maximum(low - points, points - high).T
+    return np.maximum(np.maximum(x, y), z)
 
 
 def _thin(

@@ -64,11 +64,11 @@ def surface_visibility(
             handle.refit()
         eye = np.mean([postures.R[row, b] @ p + postures.t[row, b] for b, p in tips.items()], 0)
         target = postures.place(row, point_body, points)
-        facing = np.einsum("ni,ni->n", postures.turn(row, point_body, normals), eye - target) > 0
-        free = wp.empty(len(target), dtype=wp.int32, device=device)
-        targets = wp.array(target.astype(np.float32), dtype=wp.vec3, device=device)
-        wp.launch(first_hits, len(target), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device)
-        seen += facing & (to_numpy(free) == 1)
+        facing = np.flatnonzero(np.einsum("ni,ni->n", postures.turn(row, point_body, normals), eye - target) > 0)
+        free = wp.empty(len(facing), dtype=wp.int32, device=device)
+        targets = wp.array(target[facing].astype(np.float32), dtype=wp.vec3, device=device)
+        wp.launch(first_hits, len(facing), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device)
+        seen[facing] += to_numpy(free) == 1
     parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in surfaces])[:-1])
     return [replace(s, seen=part) for s, part in zip(surfaces, parts, strict=True)]
 

@@ -46,16 +46,16 @@ def runs(monkeypatch):
 
 def test_yield_and_inputs_go_from_run_to_run(job, runs):
     with Bench() as several:
-        results = several.measure([job(object="tiny", rows=40), job(object="tiny", rows=20)], repeat=2)
+        results = several.measure([job(object="tiny", rows=20), job(object="tiny", rows=10)], repeat=2)
         count = len(runs)
-        (later,) = several.measure([job(object="tiny", rows=10)], repeat=1)
+        (later,) = several.measure([job(object="tiny", rows=5)], repeat=1)
     trials = [(trial.rows, trial.rate) for trial, _ in runs[:count]]
     after = [outcome.job.measured_rate for _, outcome in runs[:count]]
     # two probes, then the jobs in turns; each begins with what the run before of the same job measured
-    assert trials[:2] == [(4, 1.0), (2, 1.0)]
-    assert trials[2:] == [(40, after[0]), (20, after[1]), (40, after[2]), (20, after[3])]
+    assert trials[:2] == [(2, 1.0), (1, 1.0)]
+    assert trials[2:] == [(20, after[0]), (10, after[1]), (20, after[2]), (10, after[3])]
     assert all(0 < rate < 100 for rate in after)
-    assert [r["grasps"] for r in results] == [40, 20]
+    assert [r["grasps"] for r in results] == [20, 10]
     assert all(not trial.out.exists() for trial, _ in runs)
     # only the first run of all made hand, object and field
     assert [all(outcome.job.inputs.hits.values()) for _, outcome in runs] == [False] + [True] * (len(runs) - 1)

@@ -84,11 +84,11 @@ def test_error_while_reporting(swift, inputs, watched, error):
 def test_progress(swift, inputs):
     seen = []
     result = make_shard(
-        swift, inputs, 0, 600, Execution(2, 100), progress=lambda rows, running: seen.append((rows, running.candidates))
+        swift, inputs, 0, 200, Execution(2, 100), progress=lambda rows, running: seen.append((rows, running.candidates))
     )
     assert [candidates for _, candidates in seen] == [256 * (i + 1) for i in range(len(seen))]
     assert [rows for rows, _ in seen] == sorted(rows for rows, _ in seen)
-    assert seen[-1] == (600, result.candidates)
+    assert seen[-1] == (200, result.candidates)
     assert result.counts["place"]["tried"] == result.candidates
     assert set(result.seconds) == set(swift.order)
     assert result.wall > 0
@@ -107,9 +107,9 @@ def test_goes_on_where_that_promises_the_rows(swift, inputs, monkeypatch):
     """Beyond its effort a shard tries twice as much at a time; it finds the same rows whatever its batches are."""
     monkeypatch.setattr(shard_module, "_LEAST_EFFORT", 512)
     poor = swift.model_copy(update={"effort": 1})
-    first, second = (make_shard(poor, inputs, 0, 600, Execution(2, batch)) for batch in (256, 512))
+    first, second = (make_shard(poor, inputs, 0, 200, Execution(2, batch)) for batch in (256, 512))
     assert first.candidates > 1024
-    impatient = make_shard(poor.model_copy(update={"patience": 1}), inputs, 0, 600, Execution(2, 256))
+    impatient = make_shard(poor.model_copy(update={"patience": 1}), inputs, 0, 200, Execution(2, 256))
     assert impatient.candidates == 1024
     assert impatient.exhausted
     assert not first.exhausted
@@ -131,13 +131,13 @@ def test_a_cancelled_shard_goes_on_where_it_was(swift, inputs, tmp_path):
 
     with pytest.raises(CancelledError):
         make_shard(
-            swift, inputs, 0, 400, Execution(1, 256), bank_cache=cache, banked=False, resume=False, progress=cancel
+            swift, inputs, 0, 200, Execution(1, 256), bank_cache=cache, banked=False, resume=False, progress=cancel
         )
     again = make_shard(
-        swift, inputs, 0, 400, Execution(1, 256), bank_cache=cache, banked=False, resume=False, progress=cancel
+        swift, inputs, 0, 200, Execution(1, 256), bank_cache=cache, banked=False, resume=False, progress=cancel
     )
     assert tried[:4] == [256, 512, 768, 1024]
-    whole = make_shard(swift, inputs, 0, 400, Execution(2, 512))
+    whole = make_shard(swift, inputs, 0, 200, Execution(2, 512))
     assert -(-again.candidates // 512) * 512 == whole.candidates
     (_, stopped), (continued, end) = again.spans
     assert stopped <= continued
@@ -146,7 +146,7 @@ def test_a_cancelled_shard_goes_on_where_it_was(swift, inputs, tmp_path):
         np.testing.assert_array_equal(getattr(again.grasps, name), getattr(whole.grasps, name))
     tried.clear()
     make_shard(
-        swift, inputs, 0, 400, Execution(1, 256), bank_cache=cache, resume=False, progress=lambda *_: tried.append(1)
+        swift, inputs, 0, 200, Execution(1, 256), bank_cache=cache, resume=False, progress=lambda *_: tried.append(1)
     )
     assert len(tried) * 256 >= again.candidates  # nothing is left of it
 

@@ -164,14 +164,14 @@ def test_surfaces_are_those_of_their_shares():
 
 
 def test_solids_are_seen_as_cameras_see_them(monkeypatch):
-    solids = random_solids(0, 3, 64)
-    assert [len(solid.views) for solid in solids] == [VIEWS] * 3
+    solids = random_solids(0, 2, 64)
+    assert [len(solid.views) for solid in solids] == [VIEWS] * 2
     monkeypatch.setattr("lgrasp.learn.grasp.solids._A_PROCESS", 2)  # one process makes two
-    for one, other in zip(random_solids(0, 2, 64), solids, strict=False):
+    for one, other in zip(random_solids(0, 2, 64), solids, strict=True):
         np.testing.assert_array_equal(one.grid.values, other.grid.values)
     views = solid_views(solids, "cpu")
     at = views.points @ views.R.mT + views.t[:, None]
-    away = views.grids.value(at, (torch.arange(3 * VIEWS) // VIEWS)[:, None]).abs()
+    away = views.grids.value(at, (torch.arange(2 * VIEWS) // VIEWS)[:, None]).abs()
     assert float(away.median()) < 0.002
 
 

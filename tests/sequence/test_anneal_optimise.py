@@ -71,7 +71,7 @@ def rows_of(case, number: int, space: np.ndarray, before: Optimised | None = Non
 
 def run(case, number: int, space: np.ndarray, before: Optimised | None = None, only=slice(None), **more) -> Optimised:
     """Grasp object ``number`` in rows of these spaces that hold what ``before`` grasped."""
-    params = OptimiserParams(iterations=24, step_period=8, temperature_period=3, hand_points=512, object_points=256)
+    params = OptimiserParams(iterations=12, step_period=4, temperature_period=3, hand_points=512, object_points=256)
     inputs = {name: values[only] for name, values in rows_of(case, number, space, before).items()}
     return optimise(case.hand, case.spaces, case.objects[:number], **inputs, **{"params": params} | more)
 
@@ -151,7 +151,7 @@ def test_more_steps_lower_the_energy(case):
 
 def test_touching_points_are_among_the_best_pairs(case):
     """Where a grasp touches: among the best hundredth of all pairs by gap, angle of normals and balance."""
-    result = run(case, 1, np.ones(12, int), params=SHORT.model_copy(update={"w_fc": 5}))
+    result = run(case, 1, np.ones(6, int), params=SHORT.model_copy(update={"w_fc": 5}))
     touching = np.flatnonzero(result.energies[:, 1] < 0.004)
     assert len(touching)
     view, (first, second) = case.hand, case.spaces[1].groups

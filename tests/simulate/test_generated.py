@@ -17,7 +17,7 @@ from lgrasp.simulate.scene import Scene, scene_of
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
 FC = PROTOCOLS["fc"]
-ROWS = 24
+ROWS = 16
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +57,8 @@ def test_half_the_time_step_gives_the_same_verdicts(found, scene, path):
 
 
 def test_ending_early_changes_no_verdict(found, scene, path):
-    whole = verdicts(scene, first(path, 12), FC, settled_stop=False)
-    assert (whole["fc_holds"] == found["fc_holds"][:12]).all()
+    whole = verdicts(scene, first(path, 6), FC, settled_stop=False)
+    assert (whole["fc_holds"] == found["fc_holds"][:6]).all()
 
 
 def test_planted_failures(scene, path):

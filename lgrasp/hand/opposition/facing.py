@@ -47,10 +47,13 @@ def opposed(
         still: the second ones are on a static surface.
     """
     line = q - p
-    width = np.linalg.norm(line, axis=1)
-    limit = _MIN_FACING_COSINE * width
-    good = (np.einsum("nd,nd->n", line, n) > limit) & (width > _WIDTH_RANGE[0]) & (width < _WIDTH_RANGE[1])
-    good &= np.einsum("nd,nd->n", line, m) < -(_MIN_PALM_COSINE * width if still else limit)
+    x, y, z = line.T
+    width = np.sqrt(x * x + y * y + z * z)
+    good = np.einsum("nd,nd->n", line, n) > _MIN_FACING_COSINE * width
+    good &= (width > _WIDTH_RANGE[0]) & (width < _WIDTH_RANGE[1])
+    left = np.flatnonzero(good)  # a tenth
+    along = np.einsum("nd,nd->n", line.take(left, 0), m.take(left, 0))
+    good[left] = along < -(_MIN_PALM_COSINE if still else _MIN_FACING_COSINE) * width[left]
     return good, width
 
 
@@ -126,7 +129,10 @@ def _contacts(
     k = rng.integers(len(points), size=count)
     row = rows[rng.integers(max(len(rows), 1), size=count)]
     body = np.repeat([model.tree.body_of(link.link) for link in side], [len(link.points) for link in side])[k]
-    return _Contacts(row, body, postures.place(row, body, points[k]), postures.turn(row, body, normals[k]))
+    place = row * postures.R.shape[1] + body
+    R, t = (a.reshape(-1, *a.shape[2:]).take(place, 0) for a in (postures.R, postures.t))
+    p, n = (np.einsum("nij,nj->ni", R, a.take(k, 0)) for a in (points, normals))
+    return _Contacts(row, body, p + t, n)
 
 
 def _moves_along(
