@@ -76,6 +76,12 @@ def generate(cli, tmp_path):
     return call
 
 
+@pytest.fixture(scope="module")
+def once(tmp_path_factory):
+    """Folder of what the first test of a file makes and all of them copy."""
+    return tmp_path_factory.mktemp("once")
+
+
 @pytest.fixture
 def process(shared_cache, tmp_path):
     """process(*arguments): start the command as a process of its own."""

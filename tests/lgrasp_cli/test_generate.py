@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -184,9 +185,10 @@ def snapshot(folder):
 
 
 @pytest.mark.parametrize("built", [False, True])
-def test_dry_run_has_no_side_effects(generate, tmp_path, built):
+def test_dry_run_has_no_side_effects(generate, shared_cache, inputs, tmp_path, built):
     own = ("--cache-dir", tmp_path / "cache")
     if built:
+        shutil.copytree(shared_cache / "hand", tmp_path / "cache" / "hand")
         generate("--shard-rows", 8, *own, rows=8)
     before = snapshot(tmp_path)
     result = generate("--shard-rows", 8, "--dry-run", *own)

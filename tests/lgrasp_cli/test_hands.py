@@ -1,6 +1,7 @@
 """Opposition spaces on the command line: listed, shown, measured, and refused when they do not fit."""
 
 import json
+import shutil
 
 import pytest
 import yaml
@@ -13,11 +14,11 @@ PINCH = "finger_1-finger_2"
 
 
 @pytest.fixture
-def jaws(cli, tmp_path):
+def jaws(cli, tmp_path, once):
     """Folder of a drafted gripper; its two jaws are one opposition space."""
-    folder = tmp_path / "made"
-    assert "opposition spaces" in cli("hands", "add", gripper(tmp_path), "--out", folder).out
-    return folder
+    if not (once / "made").exists():
+        assert "opposition spaces" in cli("hands", "add", gripper(tmp_path), "--out", once / "made").out
+    return shutil.copytree(once / "made", tmp_path / "made")
 
 
 def change(folder, spaces) -> None:
@@ -101,19 +102,19 @@ def test_spaces_that_do_not_fit_are_refused(cli, jaws):
     assert "did you mean 'sides'" in cli("hands", "show", jaws).error()
 
 
-def test_compare_prints_a_line_for_each_hand(cli, quick, tmp_path):
-    given = ("hands", "compare", "allegro", "--object", "sphere", "-n", 3, "-p", quick, "--out", tmp_path / "out")
+def test_compare_prints_a_line_for_each_hand(cli, jaws, quick, tmp_path):
+    given = ("hands", "compare", jaws, "--object", "sphere", "-n", 3, "-p", quick, "--out", tmp_path / "out")
     found = cli(*given, "--vary", "link_scale:1.1", "--json", tmp_path / "found.json")
     lines = found.out.splitlines()
     assert [line.split()[:2] for line in lines[:3]] == [
         ["hand", "rows"],
-        ["allegro", "3"],
-        ["allegro-link_scale-1.1", "3"],
+        ["jaws", "3"],
+        ["jaws-link_scale-1.1", "3"],
     ]
     assert f"page  {tmp_path / 'out' / 'compare.html'}" in found.out
     hands = json.loads((tmp_path / "found.json").read_text())["hands"]
     assert [hand["all"]["rows"] for hand in hands] == [3, 3]
     again = json.loads(cli(*given, "--json", "-").out)  # without the variant: its hand is there already
     assert (again["made"], again["present"]) == (0, 3)
-    assert ["sphere", "allegro", "3"] in [line.split()[:3] for line in cli(*given, "--verbose").out.splitlines()]
+    assert ["sphere", "jaws", "3"] in [line.split()[:3] for line in cli(*given, "--verbose").out.splitlines()]
     assert "belongs to another run" in cli(*given, "-n", 4).error()

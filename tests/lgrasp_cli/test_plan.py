@@ -19,7 +19,7 @@ QUICK = ("--starts", 4, "--device", "cpu")
 @pytest.fixture
 def cloud(tmp_path):
     """A ball of 7 cm on a table, with labels, seen from above."""
-    n = trimesh.creation.icosphere(subdivisions=4).vertices
+    n = trimesh.creation.icosphere(subdivisions=3).vertices
     ball = 0.035 * n + [0, 0, 0.2]
     rng = np.random.default_rng(0)
     table = np.column_stack([rng.uniform(-0.2, 0.2, (500, 2)), np.zeros(500)])

@@ -60,7 +60,8 @@ def test_force_of_preparations_is_rebuild(cli, quick):
 
 def test_force_of_hands_add_is_overwrite(cli, tmp_path):
     base = ("hands", "add", gripper(tmp_path), "--out", tmp_path / "made")
-    assert cli(*base).code == 0
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "hand.yaml").write_text("name: made")
     assert "--overwrite" in cli(*base).error()
     assert cli(*base, "--overwrite").err == ""
     assert "--force is now --overwrite;" in cli(*base, "--force").err
