@@ -1,5 +1,5 @@
-"""README, quickstart and the page on steering run as written, but with fewer rows, a small contact field and plain
-pictures, in an empty folder; the first two with what a wheel installs."""
+"""README, quickstart and the page on steering run as written, but with fewer rows and plain pictures, in an empty
+folder; the first two with what a wheel installs."""
 
 import json
 import os
@@ -14,14 +14,10 @@ from pathlib import Path
 import pytest
 import warp as wp
 from support.pictures import PLAIN
-from support.places import QUICK, ROOT
+from support.places import ROOT
 
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FEWER = {
-    "build-field": ("-p", QUICK),  # the same field as the next one's
-    "generate": ("-n", "4", "--set", "field.records=20000"),
-    "render": ("-n", "2"),
-}
+FEWER = {"generate": ("-n", "4"), "render": ("-n", "2")}
 
 SCRIPT = """
 import json, os, sys
@@ -56,7 +52,7 @@ def blocks(page: str) -> Iterator[tuple[str, str]]:
 
 
 def commands(block: str) -> Iterator[list[str]]:
-    """The words of each line after lgrasp, with fewer rows and records."""
+    """The words of each line after lgrasp, with fewer rows."""
     for line in block.splitlines():
         command, *words = shlex.split(line, comments=True)
         assert command == "lgrasp"
