@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.outcomes import KEPT, PINCH, SQUEEZE
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.cholesky import solving
+from lgrasp.math.cholesky import mat_dof, solve_dofs
 from lgrasp.math.constants import SLIDING_ARM
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
 from lgrasp.math.limits import MAX_CONTACTS, MAX_DOFS, MAX_JOINTS
@@ -19,9 +19,6 @@ _SHIFT_STEPS = wp.constant(3)
 _SHIFT_DAMPING = wp.constant(1.0e-4)  # [m2/rad2]
 _SHIFT_STEP = wp.constant(0.4)  # [rad or m] of a joint, at most
 _TINY = wp.constant(1.0e-12)
-
-_mat_dof = wp.types.matrix((MAX_DOFS, MAX_DOFS), wp.float32)
-_solve_dofs = solving(MAX_DOFS)
 
 
 @wp.func
@@ -81,7 +78,7 @@ def back_off(
     goal = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.float32)
     for it in range(_SHIFT_STEPS):
         group_forward(hand.kin, g, q, X, 0)
-        A = _mat_dof()
+        A = mat_dof()
         b = vec_dof()
         for c in range(contacts):
             p = wp.transform_point(X[body[c]], points[c])
@@ -97,7 +94,7 @@ def back_off(
                 a = hand.kin.joint_parent[j0 + a]
             b += J * (goal[c] - at)
             A += wp.outer(J, J)
-        step = _solve_dofs(A, b, dofs, _SHIFT_DAMPING, _TINY)
+        step = solve_dofs(A, b, dofs, _SHIFT_DAMPING, _TINY)
         for d in range(dofs):
             q[d] = q[d] + wp.clamp(step[d], -_SHIFT_STEP, _SHIFT_STEP)
         q = clamp_dofs(hand.kin, g, q)

@@ -15,7 +15,7 @@ import warp as wp
 
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.cholesky import solving
+from lgrasp.math.cholesky import mat_dof, solve_dofs
 from lgrasp.math.constants import SLIDING_ARM
 from lgrasp.math.kinematics import point_column, vec_dof
 from lgrasp.math.limits import MAX_DOFS
@@ -29,9 +29,6 @@ MOST_SQUEEZE = wp.constant(1000.0)
 """Squeezes above are not distinguished [N]."""
 _LEAST_TWIST = wp.constant(1.0e-3)  # what resists turns about the line of two contacts [N m/rad]
 _TINY = wp.constant(1.0e-9)
-
-_mat_dof = wp.types.matrix((MAX_DOFS, MAX_DOFS), wp.float32)
-_solve_dofs = solving(MAX_DOFS)
 
 
 @wp.func
@@ -49,7 +46,7 @@ def _finger_gives(
     T = at.pose[at.of[s]]
     j0 = hand.kin.joint_first[g]
     dofs = hand.kin.dof_first[g + 1] - hand.kin.dof_first[g]
-    Q = _mat_dof()
+    Q = mat_dof()
     B = wp.zeros(shape=(6,), dtype=vec_dof)
     touches = int(0)
     for c in range(at.contact.shape[1]):
@@ -75,7 +72,7 @@ def _finger_gives(
     gives = wp.spatial_matrix()
     if touches == 1:
         for e in range(6):
-            x = _solve_dofs(Q, B[e], dofs, limits.squeeze_stiffness, _TINY)
+            x = solve_dofs(Q, B[e], dofs, limits.squeeze_stiffness, _TINY)
             for f in range(6):
                 gives[f, e] = wp.dot(B[f], x)
     return gives

@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from lgrasp.math.limits import MAX_DOFS
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.unrolled import unrolled
 
@@ -46,3 +47,8 @@ def solving(size: int) -> Any:
         return x
 
     return solve
+
+
+mat_dof = wp.types.matrix((MAX_DOFS, MAX_DOFS), wp.float32)
+solve_dofs = solving(MAX_DOFS)
+"""For the joints of a group."""

@@ -1,7 +1,6 @@
 """Kernels of the wrap stage: further links of a finger are laid on the object, its first contact slides."""
 
 from enum import IntEnum
-from typing import Any
 
 import warp as wp
 
@@ -11,9 +10,9 @@ from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.grasp.structs import FURTHER, Candidates, State, vec_further
 from lgrasp.hand.arrays import Hand, thumb_placed
-from lgrasp.math.cholesky import solving
+from lgrasp.math.cholesky import mat_dof, solve_dofs
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
-from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
+from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
 from lgrasp.math.sdf import sdf_below, sdf_gradient, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -154,227 +153,218 @@ def list_realised(
         listed_out[i] = (row * shape[1] + g) * shape[2] + m
 
 
-def _wrapping(size: int) -> Any:
-    """The kernel for groups of at most ``size`` dofs: what is known to the compiler stays in registers."""
-    square, column, solve = wp.types.matrix((size, size), wp.float32), wp.types.vector(size, wp.float32), solving(size)
-
-    @wp.func
-    def add_rows(
-        hand: Hand,
-        g: wp.int32,
-        params: WrapValues,
-        pose: wp.transform,
-        X: wp.array(dtype=wp.transform),
-        body: wp.int32,
-        touch: LinkTouch,
-        asked: wp.bool,
-        still: wp.int32,
-        A: square,
-        b: column,
-    ):
-        """The normal equations and the rows of one link: its distance, and its normal where it is asked to touch."""
-        aim = _OFF - touch.gap
-        weight = float(0.0)
-        if asked:
-            aim = -(touch.gap + params.contact_indentation)
-            weight = params.normal_weight * params.normal_weight
-        if not asked and aim < 0.0:
-            return A, b
-        aim = wp.clamp(aim, -_FARTHEST_STEP, _FARTHEST_STEP)
-        j0 = hand.kin.joint_first[g]
-        dofs = hand.kin.dof_free[g]
-        p = wp.transform_point(X[body], touch.local)
-        across = wp.transform_vector(pose, touch.normal)
-        f = wp.transform_vector(X[body], touch.out)
-        turn = -(f + across) * _LEVER
-        J = column()
-        R = wp.zeros(shape=(size,), dtype=wp.vec3)
-        j = body
-        while j >= 0:
-            d = hand.kin.joint_dof[j0 + j]
-            moved = point_column(hand.kin, j0 + j, X[j], p)
-            J[d] = J[d] + wp.dot(moved, across)
-            R[d] = R[d] + point_column(hand.kin, j0 + j, X[j], p + f * _LEVER) - moved
-            j = hand.kin.joint_parent[j0 + j]
-        for a in range(size):
-            if a >= dofs or ((still >> a) & 1) == 1:
-                J[a] = 0.0
-                R[a] = wp.vec3(0.0)
-            b[a] = b[a] + J[a] * aim + weight * wp.dot(R[a], turn)
-            for k in range(a + 1):
-                A[a, k] = A[a, k] + J[a] * J[k] + weight * wp.dot(R[a], R[k])
+@wp.func
+def _add_rows(
+    hand: Hand,
+    g: wp.int32,
+    params: WrapValues,
+    pose: wp.transform,
+    X: wp.array(dtype=wp.transform),
+    body: wp.int32,
+    touch: LinkTouch,
+    asked: wp.bool,
+    still: wp.int32,
+    A: mat_dof,
+    b: vec_dof,
+):
+    """The normal equations and the rows of one link: its distance, and its normal where it is asked to touch."""
+    aim = _OFF - touch.gap
+    weight = float(0.0)
+    if asked:
+        aim = -(touch.gap + params.contact_indentation)
+        weight = params.normal_weight * params.normal_weight
+    if not asked and aim < 0.0:
         return A, b
+    aim = wp.clamp(aim, -_FARTHEST_STEP, _FARTHEST_STEP)
+    j0 = hand.kin.joint_first[g]
+    dofs = hand.kin.dof_free[g]
+    p = wp.transform_point(X[body], touch.local)
+    across = wp.transform_vector(pose, touch.normal)
+    f = wp.transform_vector(X[body], touch.out)
+    turn = -(f + across) * _LEVER
+    J = vec_dof()
+    R = wp.zeros(shape=(MAX_DOFS,), dtype=wp.vec3)
+    j = body
+    while j >= 0:
+        d = hand.kin.joint_dof[j0 + j]
+        moved = point_column(hand.kin, j0 + j, X[j], p)
+        J[d] = J[d] + wp.dot(moved, across)
+        R[d] = R[d] + point_column(hand.kin, j0 + j, X[j], p + f * _LEVER) - moved
+        j = hand.kin.joint_parent[j0 + j]
+    for a in range(MAX_DOFS):
+        if a >= dofs or ((still >> a) & 1) == 1:
+            J[a] = 0.0
+            R[a] = wp.vec3(0.0)
+        b[a] = b[a] + J[a] * aim + weight * wp.dot(R[a], turn)
+        for k in range(a + 1):
+            A[a, k] = A[a, k] + J[a] * J[k] + weight * wp.dot(R[a], R[k])
+    return A, b
 
-    @wp.func
-    def bounded_step(hand: Hand, g: wp.int32, q: vec_dof, params: WrapValues, A: square, b: column):
-        """q after the damped least-squares step of the joints that it does not press against a limit."""
-        first = hand.kin.dof_first[g]
-        dofs = hand.kin.dof_free[g]
-        M = A
-        r = b
-        for a in range(size):
-            M[a, a] = M[a, a] + params.damping
-        step = solve(M, r, size, 0.0, 1.0e-12)
-        stuck = int(0)
-        for a in range(dofs):
-            low = hand.kin.dof_lower[first + a]
-            high = hand.kin.dof_upper[first + a]
-            if (q[a] <= low + _AT_LIMIT and step[a] < 0.0) or (q[a] >= high - _AT_LIMIT and step[a] > 0.0):
-                stuck += 1
-                r[a] = 0.0
-                for k in range(size):
-                    if k < a:
-                        M[a, k] = 0.0
-                    if k > a:
-                        M[k, a] = 0.0
-        if stuck > 0:
-            step = solve(M, r, size, 0.0, 1.0e-12)
-        moved = q
-        for a in range(dofs):
-            moved[a] = moved[a] + wp.clamp(step[a], -params.step, params.step)
-        return clamp_dofs(hand.kin, g, moved)
 
-    @wp.func
-    def ask_link(
-        hand: Hand,
-        obj: Object,
-        runs: PalmarRuns,
-        params: WrapValues,
-        g: wp.int32,
-        pose: wp.transform,
-        still: wp.int32,
-        start: vec_dof,
-        touch: wp.array(dtype=LinkTouch),
-        task: wp.array(dtype=wp.int32),
-        n: wp.int32,
-    ):
-        """Whether the links that are asked to touch all do after a few steps from a posture, and that posture."""
-        q = start
-        j0 = hand.kin.joint_first[g]
-        T_object = wp.transform_inverse(pose)
-        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-        for it in range(params.iterations + 1):
-            group_forward(hand.kin, g, q, X, 0)
-            missing = int(0)
-            A = square()
-            b = column()
-            for i in range(n):
-                body = runs.body[touch[i].run] - 1 - j0
-                touch[i] = nearest_touch(hand, obj, runs, T_object * X[body], touch[i], 2)
-                if task[i] == _ASKED and not fits(hand, runs, params, T_object * X[body], touch[i]):
-                    missing += 1
-                A, b = add_rows(hand, g, params, pose, X, body, touch[i], task[i] == _ASKED, still, A, b)
-            if missing == 0:
-                return True, q
-            if it < params.iterations:
-                q = bounded_step(hand, g, q, params, A, b)
-        return False, q
+@wp.func
+def _bounded_step(hand: Hand, g: wp.int32, q: vec_dof, params: WrapValues, A: mat_dof, b: vec_dof):
+    """q after the damped least-squares step of the joints that it does not press against a limit."""
+    first = hand.kin.dof_first[g]
+    dofs = hand.kin.dof_free[g]
+    M = A
+    r = b
+    for a in range(MAX_DOFS):
+        M[a, a] = M[a, a] + params.damping
+    step = solve_dofs(M, r, dofs, 0.0, 1.0e-12)
+    stuck = int(0)
+    for a in range(dofs):
+        low = hand.kin.dof_lower[first + a]
+        high = hand.kin.dof_upper[first + a]
+        if (q[a] <= low + _AT_LIMIT and step[a] < 0.0) or (q[a] >= high - _AT_LIMIT and step[a] > 0.0):
+            stuck += 1
+            r[a] = 0.0
+            for k in range(MAX_DOFS):
+                if k < a:
+                    M[a, k] = 0.0
+                if k > a:
+                    M[k, a] = 0.0
+    if stuck > 0:
+        step = solve_dofs(M, r, dofs, 0.0, 1.0e-12)
+    moved = q
+    for a in range(dofs):
+        moved[a] = moved[a] + wp.clamp(step[a], -params.step, params.step)
+    return clamp_dofs(hand.kin, g, moved)
 
-    @wp.kernel
-    def wrap_fingers(
-        hand: Hand,
-        field: Field,
-        obj: Object,
-        held: Held,
-        runs: PalmarRuns,
-        params: WrapValues,
-        listed: wp.array(dtype=wp.int32),
-        candidates_out: Candidates,
-        counts_out: wp.array(dtype=wp.int32),
-    ):
-        """Postures of realised candidates in which further links of the finger touch; others stay as they are.
 
-        Link after link is asked to touch, the nearest first, with steps dq := argmin sum_l (n_l . J_l dq + g_l +
-        indentation)^2 + w^2 |normals|^2 + damping |dq|^2 over those asked; g_l is the distance of link and object, n_l
-        the object's normal there. Contacts, the first one too, are free to slide; other links are pushed off the
-        object. ``surface`` and ``q`` of a candidate follow its first contact, ``further`` are the others. Candidates
-        whose finger is not clear, or does not touch by its mesh, in either posture are blocked.
-
-        Args:
-            runs: points of links that may touch.
-            listed: the realised candidates, (P * G * M,); WrapCount.TRIED of them are there.
-            counts_out: WrapCount, (2,).
-        """
-        i = wp.tid()
-        if i >= counts_out[int(WrapCount.TRIED)]:
-            return
-        slots = candidates_out.state.shape[2]
-        row = listed[i] // (candidates_out.state.shape[1] * slots)
-        g = (listed[i] // slots) % candidates_out.state.shape[1]
-        m = listed[i] % slots
-        pose = candidates_out.poses.pose[row]
-        resting = candidates_out.poses.resting[row]
-        T_object = wp.transform_inverse(pose)
-        h = candidates_out.poses.index[row] // held.tries
-        own = hand.contacts.link[field.point[candidates_out.record[row, g, m]]]
-        j0 = hand.kin.joint_first[g]
-        X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-        touch = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
-        found = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
-        task = wp.zeros(shape=(_LINKS,), dtype=wp.int32)
-        posture = candidates_out.q[row, g, m]
-        group_forward(hand.kin, g, posture, X, 0)
-        n = near_links(hand, obj, runs, params, g, T_object, X, touch)
-        first = int(-1)
+@wp.func
+def _ask_link(
+    hand: Hand,
+    obj: Object,
+    runs: PalmarRuns,
+    params: WrapValues,
+    g: wp.int32,
+    pose: wp.transform,
+    still: wp.int32,
+    start: vec_dof,
+    touch: wp.array(dtype=LinkTouch),
+    task: wp.array(dtype=wp.int32),
+    n: wp.int32,
+):
+    """Whether the links that are asked to touch all do after a few steps from a posture, and that posture."""
+    q = start
+    j0 = hand.kin.joint_first[g]
+    T_object = wp.transform_inverse(pose)
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    for it in range(params.iterations + 1):
+        group_forward(hand.kin, g, q, X, 0)
+        missing = int(0)
+        A = mat_dof()
+        b = vec_dof()
         for i in range(n):
-            task[i] = _WAITING
-            if runs.link[touch[i].run] == own:
-                first = i
-                task[i] = _ASKED
-        made = int(0)
-        for _round in range(wp.where(first < 0, 0, params.rounds)):
-            group_forward(hand.kin, g, posture, X, 0)
-            for i in range(n):
-                T = T_object * X[runs.body[touch[i].run] - 1 - j0]
-                touch[i] = nearest_touch(hand, obj, runs, T, touch[i], _SLIDES)
-            added = next_link(runs, params, touch, task, n)
-            if added < 0:
-                break
-            task[added] = _ASKED
-            done, q = ask_link(hand, obj, runs, params, g, pose, held.frozen[h, g], posture, touch, task, n)
-            if done:
-                posture = q
-                made += 1
-                for i in range(n):
-                    found[i] = touch[i]
-            else:
-                task[added] = _FAILED
+            body = runs.body[touch[i].run] - 1 - j0
+            touch[i] = nearest_touch(hand, obj, runs, T_object * X[body], touch[i], 2)
+            if task[i] == _ASKED and not fits(hand, runs, params, T_object * X[body], touch[i]):
+                missing += 1
+            A, b = _add_rows(hand, g, params, pose, X, body, touch[i], task[i] == _ASKED, still, A, b)
+        if missing == 0:
+            return True, q
+        if it < params.iterations:
+            q = _bounded_step(hand, g, q, params, A, b)
+    return False, q
+
+
+@wp.kernel
+def wrap_fingers(
+    hand: Hand,
+    field: Field,
+    obj: Object,
+    held: Held,
+    runs: PalmarRuns,
+    params: WrapValues,
+    listed: wp.array(dtype=wp.int32),
+    candidates_out: Candidates,
+    counts_out: wp.array(dtype=wp.int32),
+):
+    """Postures of realised candidates in which further links of the finger touch; others stay as they are.
+
+    Link after link is asked to touch, the nearest first, with steps dq := argmin sum_l (n_l . J_l dq + g_l +
+    indentation)^2 + w^2 |normals|^2 + damping |dq|^2 over those asked; g_l is the distance of link and object, n_l
+    the object's normal there. Contacts, the first one too, are free to slide; other links are pushed off the
+    object. ``surface`` and ``q`` of a candidate follow its first contact, ``further`` are the others. Candidates
+    whose finger is not clear, or does not touch by its mesh, in either posture are blocked.
+
+    Args:
+        runs: points of links that may touch.
+        listed: the realised candidates, (P * G * M,); WrapCount.TRIED of them are there.
+        counts_out: WrapCount, (2,).
+    """
+    i = wp.tid()
+    if i >= counts_out[int(WrapCount.TRIED)]:
+        return
+    slots = candidates_out.state.shape[2]
+    row = listed[i] // (candidates_out.state.shape[1] * slots)
+    g = (listed[i] // slots) % candidates_out.state.shape[1]
+    m = listed[i] % slots
+    pose = candidates_out.poses.pose[row]
+    resting = candidates_out.poses.resting[row]
+    T_object = wp.transform_inverse(pose)
+    h = candidates_out.poses.index[row] // held.tries
+    own = hand.contacts.link[field.point[candidates_out.record[row, g, m]]]
+    j0 = hand.kin.joint_first[g]
+    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
+    touch = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
+    found = wp.zeros(shape=(_LINKS,), dtype=LinkTouch)
+    task = wp.zeros(shape=(_LINKS,), dtype=wp.int32)
+    posture = candidates_out.q[row, g, m]
+    group_forward(hand.kin, g, posture, X, 0)
+    n = near_links(hand, obj, runs, params, g, T_object, X, touch)
+    first = int(-1)
+    for i in range(n):
+        task[i] = _WAITING
+        if runs.link[touch[i].run] == own:
+            first = i
+            task[i] = _ASKED
+    made = int(0)
+    for _round in range(wp.where(first < 0, 0, params.rounds)):
         group_forward(hand.kin, g, posture, X, 0)
-        clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
-        if made > 0 and clear:
-            surface = int(-1)
-            further = vec_further(-1)
-            more = int(0)
+        for i in range(n):
+            T = T_object * X[runs.body[touch[i].run] - 1 - j0]
+            touch[i] = nearest_touch(hand, obj, runs, T, touch[i], _SLIDES)
+        added = next_link(runs, params, touch, task, n)
+        if added < 0:
+            break
+        task[added] = _ASKED
+        done, q = _ask_link(hand, obj, runs, params, g, pose, held.frozen[h, g], posture, touch, task, n)
+        if done:
+            posture = q
+            made += 1
             for i in range(n):
-                if task[i] == _ASKED and (i == first or more < FURTHER):
-                    at = contact_beside(
-                        hand, obj, runs, params, T_object * X[runs.body[found[i].run] - 1 - j0], found[i]
-                    )
-                    if i == first:
-                        surface = at
-                    elif at >= 0:
-                        further[more] = at
-                        further[FURTHER + more] = runs.place[found[i].run]
-                        more += 1
-            if surface >= 0 and more > 0:
-                candidates_out.q[row, g, m] = posture
-                candidates_out.surface[row, g, m] = surface
-                candidates_out.further[row, g, m] = further
-                wp.atomic_add(counts_out, WrapCount.WRAPPED, 1)
-                return
-        if made > 0:
-            group_forward(hand.kin, g, candidates_out.q[row, g, m], X, 0)
-            clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
-        if clear:
-            c = field.point[candidates_out.record[row, g, m]]
-            T = T_object * X[hand.contacts.body[c] - 1 - j0]
-            at = candidates_out.surface[row, g, m]
-            clear = touches_there(hand, obj, params, hand.contacts.grid[c], T, at)
-        if not clear:
-            candidates_out.state[row, g, m] = State.BLOCKED
-
-    return wrap_fingers
-
-
-wrap_fingers = {size: _wrapping(size) for size in DOF_SIZES}
-"""Kernels by the most dofs of a group."""
+                found[i] = touch[i]
+        else:
+            task[added] = _FAILED
+    group_forward(hand.kin, g, posture, X, 0)
+    clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
+    if made > 0 and clear:
+        surface = int(-1)
+        further = vec_further(-1)
+        more = int(0)
+        for i in range(n):
+            if task[i] == _ASKED and (i == first or more < FURTHER):
+                at = contact_beside(hand, obj, runs, params, T_object * X[runs.body[found[i].run] - 1 - j0], found[i])
+                if i == first:
+                    surface = at
+                elif at >= 0:
+                    further[more] = at
+                    further[FURTHER + more] = runs.place[found[i].run]
+                    more += 1
+        if surface >= 0 and more > 0:
+            candidates_out.q[row, g, m] = posture
+            candidates_out.surface[row, g, m] = surface
+            candidates_out.further[row, g, m] = further
+            wp.atomic_add(counts_out, WrapCount.WRAPPED, 1)
+            return
+    if made > 0:
+        group_forward(hand.kin, g, candidates_out.q[row, g, m], X, 0)
+        clear = clear_of_all(hand, obj, held, params, h, g, pose, resting, X)
+    if clear:
+        c = field.point[candidates_out.record[row, g, m]]
+        T = T_object * X[hand.contacts.body[c] - 1 - j0]
+        at = candidates_out.surface[row, g, m]
+        clear = touches_there(hand, obj, params, hand.contacts.grid[c], T, at)
+    if not clear:
+        candidates_out.state[row, g, m] = State.BLOCKED

@@ -40,8 +40,7 @@ def run(inputs: CandidateTable, params: WrapParams, context: Context) -> tuple[C
     asked = [context.hand.struct, context.field.struct, context.object.struct, context.held.struct, _probes(context)]
     shape, listed = inputs.surface.shape, wp.empty(inputs.surface.size, dtype=wp.int32, device=d)
     wp.launch(list_realised, shape, [table.struct], [listed, tally.device], device=d)
-    kernel = wrap_fingers[context.hand.model.tree.dof_size]
-    wp.launch(kernel, listed.shape, [*asked, values, listed], [table.struct, tally.device], device=d)
+    wp.launch(wrap_fingers, listed.shape, [*asked, values, listed], [table.struct, tally.device], device=d)
     return table, tally
 
 
