@@ -34,6 +34,15 @@ class Postures:
         """Points (n, 3) [m] of bodies in the base frame; postures, bodies and points broadcast."""
         return self.turn(rows, bodies, points) + self.t[rows, bodies]
 
+    def put(
+        self, rows: int | np.ndarray, bodies: int | np.ndarray, points: np.ndarray, normals: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """:meth:`place` and :meth:`turn` of as many points as directions (n, 3), which gathers each pose once."""
+        at = np.broadcast_to(rows * self.R.shape[1] + bodies, len(points))
+        R, t = (a.reshape(-1, *a.shape[2:]).take(at, 0) for a in (self.R, self.t))
+        p, n = (np.einsum("nij,nj->ni", R, a) for a in (points, normals))
+        return p + t, n
+
 
 def sample_bodies(model: HandModel, q: np.ndarray, device: str = "cpu") -> Postures:
     """Body poses at postures q (N, K), and which of them are clear."""

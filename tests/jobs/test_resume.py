@@ -275,11 +275,8 @@ def test_killed_while_writing(whole, raw_grasps, job, cache_root, tmp_path):
     assert listed(out) == listed(whole)
 
 
-def test_processes_share_a_cache(inputs, whole, raw_grasps, cache_root, tmp_path):
-    """That has nothing but the hand."""
+def test_processes_share_an_empty_cache(whole, raw_grasps, tmp_path):
     out, cache = tmp_path / "array", tmp_path / "cache"
-    (cache / "hand").mkdir(parents=True)
-    shutil.copy(Cache(cache_root).path("hand", inputs.keys.hand), cache / "hand")
     children = [Child(out, cache, 80, task=(task, 2)) for task in range(2)]
     assert [child.finish() for child in children] == [0, 0]
     assert raw_grasps(out) == raw_grasps(whole)

@@ -169,11 +169,11 @@ def test_grasps_are_planned_from_a_cloud_by_a_network(generate, cli):
     one, two = (torch.load(name, weights_only=True) for name in ("net.pt", "again.pt"))
     assert all(torch.equal(values, two[name]) for name, values in one.items())
     told = cli(
-        "learn", "eval", "net.pt", "out", "--clouds", 1, "-n", 1, "--out", "plans", "--device", "cpu", "--json", "-"
+        "learn", "eval", "net.pt", "out", "--clouds", 1, "-n", 2, "--out", "plans", "--device", "cpu", "--json", "-"
     )
     assert told.code == 0, told
     found = json.loads(told.out)["kinds"]["one view"]["tiny"]
-    assert found["asked"] == 1
+    assert found["asked"] == 2
     assert found["delivered"] == sum(len(lg.open(path)) for path in Path("plans/one-view").glob("*.h5"))
     points = lg.load_object("tiny")
     seen = points.contact_normals[:, 2] > 0

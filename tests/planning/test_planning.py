@@ -68,10 +68,10 @@ def test_hands_are_compared_by_what_the_check_finds(planner, inputs):
 def test_where_control_poses_are_bounded_the_best_that_meets_them_is_the_plan(inputs):
     """Of those compared first many fail what only control poses show."""
     params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": 0})
-    least = float(np.median(Planner(inputs.hand, inputs.object.model, 0.12, params).run(10).grasps.metrics["epsilon"]))
+    least = float(np.median(Planner(inputs.hand, inputs.object.model, 0.12, params).run(20).grasps.metrics["epsilon"]))
     bounded = params.model_copy(update={"bounds": params.bounds.changed(min_epsilon=least)})
-    table = Planner(inputs.hand, inputs.object.model, 0.12, bounded).run(10).grasps
-    assert len(table) > 5
+    table = Planner(inputs.hand, inputs.object.model, 0.12, bounded).run(20).grasps
+    assert len(table) > 10
     assert table.metrics["epsilon"].min() >= least
 
 
@@ -85,13 +85,13 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
 
 @pytest.fixture(scope="module")
 def plan(inputs) -> Callable[..., Planned]:
-    """plan(tried, draws): what is planned of 10 starts; of the ninth the first hand does not hold, and another does."""
+    """plan(tried, draws): what is planned of 60 starts, of fewer none may differ."""
 
     @cache
     def plan(tried: int, draws: int = 0) -> Planned:
         several = {"rolls": 12, "finalists": 12, "tried": tried, "hold": HoldTest(draws=draws)}
         params = QUICK.model_copy(update=several)
-        return Planner(inputs.hand, inputs.object.model, 0.12, params).run(10)
+        return Planner(inputs.hand, inputs.object.model, 0.12, params).run(60)
 
     return plan
 
@@ -152,19 +152,19 @@ def test_hands_that_hold_less_often_are_drawn_and_tried_more_often_unless_told()
 def test_hands_that_do_not_hold_as_often_as_is_asked_are_no_plans(inputs, plan):
     """Of each start the best stays a plan if it holds so often, else it is counted; none may be another."""
     params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": 12, "hold": HoldTest(draws=4)})
-    strict = params.model_copy(update={"min_hold_probability": 0.25})
+    strict = params.model_copy(update={"min_hold_probability": 0.75})
     free = plan(12, 4)
     planner = Planner(inputs.hand, inputs.object.model, 0.12, strict)
-    asked = planner.run(10)
+    asked = planner.run(60)
     assert 0 < asked.counts[NOT_HELD] == free.counts["kept"] - asked.counts["kept"] < free.counts["kept"]
     assert free.counts[NOT_HELD] == 0
     found = HoldTester(inputs.hand, inputs.object, params.hold).run(ControlPoses.of(asked.grasps), 0)
     assert found["hold_success"].all()
-    assert (found["hold_probability"] >= 0.25).all()
-    every = planner.run(10, keep_invalid=True).grasps
+    assert (found["hold_probability"] >= 0.75).all()
+    every = planner.run(60, keep_invalid=True).grasps
     lost = every.metrics["failed_bound"] == FAILED_BOUNDS.index("min_hold_probability")
     assert lost.sum() == asked.counts[NOT_HELD]
     assert not every.metrics["valid"][lost].any()
     untried = strict.model_copy(update={"tried": 0})
-    counts = Planner(inputs.hand, inputs.object.model, 0.12, untried).run(10).counts
+    counts = Planner(inputs.hand, inputs.object.model, 0.12, untried).run(60).counts
     assert counts["kept"] == free.counts["kept"]  # who tries nothing refuses nothing

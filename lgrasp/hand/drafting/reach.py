@@ -47,7 +47,7 @@ def finger_touches(
     """Contact points of a body's allowed surface (body frame) at the postures at which its finger is clear."""
     rows = np.repeat(np.flatnonzero(postures.clear[:, group]), each)
     k = np.random.default_rng(body).integers(len(points), size=len(rows))
-    return Touch(name, postures.place(rows, body, points[k]), postures.turn(rows, body, normals[k]))
+    return Touch(name, *postures.put(rows, body, points[k], normals[k]))
 
 
 def still_touches(name: str, points: np.ndarray, normals: np.ndarray, count: int) -> Touch:

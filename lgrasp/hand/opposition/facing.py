@@ -129,10 +129,7 @@ def _contacts(
     k = rng.integers(len(points), size=count)
     row = rows[rng.integers(max(len(rows), 1), size=count)]
     body = np.repeat([model.tree.body_of(link.link) for link in side], [len(link.points) for link in side])[k]
-    place = row * postures.R.shape[1] + body
-    R, t = (a.reshape(-1, *a.shape[2:]).take(place, 0) for a in (postures.R, postures.t))
-    p, n = (np.einsum("nij,nj->ni", R, a.take(k, 0)) for a in (points, normals))
-    return _Contacts(row, body, p + t, n)
+    return _Contacts(row, body, *postures.put(row, body, points.take(k, 0), normals.take(k, 0)))
 
 
 def _moves_along(
