@@ -29,7 +29,7 @@ WORKERS ?= 2
 
 help:
 	@echo "make demo    set up, build the Allegro contact field, generate 1,000 grasps of the sample mug"
-	@echo "make test    set up, then the gate: ruff, pyright, pytest"
+	@echo "make test    set up, then the gate: ruff, ty, pytest"
 	@echo "make setup | check | lint | format | type | pytest | docs | bench | wheel | clean"
 
 setup: $(STAMP)
@@ -49,9 +49,7 @@ demo: setup
 
 test: check
 
-# pyright has one thread: the tests start beside it.
-check: lint
-	@$(MAKE) --no-print-directory -j 2 type pytest
+check: lint type pytest
 
 lint: setup
 	$(BIN)/ruff check .
@@ -62,7 +60,7 @@ format: setup
 	$(BIN)/ruff format .
 
 type: setup
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/ty check --python $(VENV) --error-on-warning
 
 # WORKERS test files run side by side, each on one thread, in their order (the longest first, few of the last are long);
 # a crash ends the run. Tests start hundreds of processes: bytecode is kept.

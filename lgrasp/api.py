@@ -231,7 +231,7 @@ def refine(
     from lgrasp.jobs.refine.shards import RefineJob
     from lgrasp.jobs.requests.shards import refine_params
 
-    what = {"params": refine_params(coarse=coarse, **params), "device": device}
+    what: dict[str, Any] = {"params": refine_params(coarse=coarse, **params), "device": device}
     what |= {} if bounds is None else {"bounds": bounds}
     with _files(grasps) as files:
         return _done(RefineJob, out, shards=files, **what)

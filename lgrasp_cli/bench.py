@@ -207,7 +207,7 @@ def bench_sequence(
     chosen = chosen.with_params("sequence", policy=policy, width=width, optimiser=optimiser)
     for method in split(methods):
         chosen.with_params("sequence", method=method)
-    how = {"scale": scale, "simulate": simulate, "device": device, "workers": workers}
+    how: dict[str, Any] = {"scale": scale, "simulate": simulate, "device": device, "workers": workers}
     how |= {"hand": hand, "rows": 1, "pipeline": chosen, "out": gettempdir()}  # nothing is written there
     drawn = object_sequences(pool, sets, seed)
     asked = [parse_model(SequenceRequest, how | {"objects": names}, "bench sequence") for names in drawn]
@@ -269,7 +269,13 @@ def bench_refine(
     cache = open_cache(cache_dir)
     from lgrasp.bench.refine import NOISES, bench_hands, refine_page
 
-    how = {"engine": engine, "params": params, "noises": NOISES if noise else (), "device": device, "cache": cache}
+    how: dict[str, Any] = {
+        "engine": engine,
+        "params": params,
+        "noises": NOISES if noise else (),
+        "device": device,
+        "cache": cache,
+    }
     result = bench_hands(split(hands), split(objects), starts, simulate, progress=say, **how)
     result["set"] = settings or []
     _print(result, json_path, refine_page(result))

@@ -41,7 +41,7 @@ _PANELS = {
 class _Panels(TyperGroup):
     """Lists commands panel by panel."""
 
-    def list_commands(self, context: typer.Context) -> list[str]:
+    def list_commands(self, ctx: Any) -> list[str]:
         place = {panel: number for number, panel in enumerate(_PANELS)}
         panels = {name: str(getattr(command, "rich_help_panel", "")) for name, command in self.commands.items()}
         return sorted(panels, key=lambda name: place.get(panels[name], len(place)))  # those of old names are hidden

@@ -96,7 +96,7 @@ def open_cache(folder: Path | None, *, fresh: bool = False) -> "Cache":
     return Cache(folder, warn=warn, fresh=fresh)
 
 
-def with_options(run: Callable[..., None], command: Callable[..., Any]) -> Callable[..., None]:
+def with_options(run: Any, command: Any) -> Callable[..., None]:
     """``run`` with the name, help and options of a command, and then its own.
 
     The argument ``how`` of a command is no option: ``run`` gives it.
@@ -109,7 +109,7 @@ def with_options(run: Callable[..., None], command: Callable[..., Any]) -> Calla
         if name != "how" and parameter.kind is not inspect.Parameter.VAR_KEYWORD
     ]
     run.__name__, run.__doc__ = command.__name__, command.__doc__
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature(parameters)
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run
 

@@ -54,7 +54,15 @@ def plan(
     """
     from lgrasp.jobs.requests.plan import PlanRequest, plan_params
 
-    what = {"hand": hand, "object": mesh, "scale": scale, "cloud": cloud, "mask": mask, "label": label, "out": out}
+    what: dict[str, Any] = {
+        "hand": hand,
+        "object": mesh,
+        "scale": scale,
+        "cloud": cloud,
+        "mask": mask,
+        "label": label,
+        "out": out,
+    }
     what |= {
         "viewpoint": position(viewpoint),
         "starts": starts,

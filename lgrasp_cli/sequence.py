@@ -57,7 +57,7 @@ def sequence(
     from lgrasp.jobs.requests.search import SequenceRequest
 
     chosen = _chosen(pipeline, seed, settings, method=method, policy=policy)
-    what = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen}
+    what: dict[str, Any] = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen}
     what |= {"out": out or _folder(hand, objects, chosen, simulate), "scale": scale, "simulate": simulate}
     how.run(how.job(SequenceRequest, "sequence", shard_rows=shard_rows, **what), _show, _profile)
 

@@ -57,9 +57,10 @@ def submit(
     name = name or f"lgrasp-{words[0]}"
     if not re.fullmatch(r"[\w.+-]+", name):
         raise ConfigError(f"--name '{name}' may hold letters, digits and '.', '_', '+', '-' only")
+    output = str(logs.absolute() / ("%x-%A_%a.log" if tasks > 1 else "%x-%j.log"))
     options = {
         "job-name": name,
-        "output": str(logs.absolute() / ("%x-%A_%a.log" if tasks > 1 else "%x-%j.log")),
+        "output": output,
         "open-mode": "append",  # of a task that is requeued
         "array": f"0-{tasks - 1}" if tasks > 1 else None,
         "gres": f"gpu:{gpus}" if gpus else None,
@@ -79,7 +80,7 @@ def submit(
     pairs = [
         ("job", f"{job}: {plural(tasks, 'task')}, {plural(parts, 'file')}"),
         ("script", str(path)),
-        ("logs", options["output"].replace("%x", name).replace("%A", job).replace("%j", job).replace("%a", "TASK")),
+        ("logs", output.replace("%x", name).replace("%A", job).replace("%j", job).replace("%a", "TASK")),
         ("cancel", f"scancel {job}"),
     ]
     return Answer({"job": job, "tasks": tasks, "files": parts, "script": str(path), "logs": str(logs)}, [pairs])

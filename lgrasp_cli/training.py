@@ -38,7 +38,7 @@ def split_rows(
     check_file(out)
     from lgrasp.dataset.split import make_split
 
-    made = make_split(paths, by=by, shares=parts, seed=seed, negatives=negatives)  # pyright: ignore[reportArgumentType]
+    made = make_split(paths, by=by, shares=parts, seed=seed, negatives=negatives)  # ty: ignore[invalid-argument-type]
     made.write(out)
     rows = [(name, f"{part.rows:,}", _listed(part.names)) for name, part in made.parts.items()]
     return Answer(

@@ -264,7 +264,7 @@ def sequence_page(result: dict[str, Any]) -> Page:
 
 
 def _space_table(title: str, spaces: dict[str, dict[str, int]], published: dict[str, float]) -> Table:
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             name,
             *(number(counts[key]) for key in ("tried", "found", "held")),

@@ -13,7 +13,7 @@ OBJECTS_HELD = "objects"
 """The number of objects in the hand, as if it were a column."""
 
 _VALID = "metrics/valid"
-_OPERATORS = {">=": np.greater_equal, "<=": np.less_equal, "==": np.equal, "!=": np.not_equal}
+_OPERATORS: dict[str, np.ufunc] = {">=": np.greater_equal, "<=": np.less_equal, "==": np.equal, "!=": np.not_equal}
 _OPERATORS |= {">": np.greater, "<": np.less}
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _PATTERN = re.compile(rf"\s*([\w/.-]+?)\s*(?:({'|'.join(_OPERATORS)})\s*({_NUMBER})\s*)?", re.ASCII)

@@ -25,7 +25,7 @@ class Gathered(NamedTuple, Generic[T]):
 
 def gather(
     paths: Paths,
-    look: Callable[[ShardReader], T] = lambda _: None,
+    look: Callable[[ShardReader], T] = lambda _: None,  # ty: ignore[invalid-parameter-default]
     *,
     leave_out: Path | None = None,
     invalid: bool = True,

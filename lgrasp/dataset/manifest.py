@@ -326,7 +326,7 @@ def compare_folder(folder: Path, *, verify: bool = True) -> Differences | None:
         ShardError: The manifest is damaged.
     """
     manifest = read_manifest(folder / MANIFEST)
-    return manifest and compare(sorted(folder.glob(f"*{SUFFIX}")), manifest, verify=verify)
+    return None if manifest is None else compare(sorted(folder.glob(f"*{SUFFIX}")), manifest, verify=verify)
 
 
 def check_files(paths: Paths, check: Callable[[Path], list[str]], *, below: bool = True) -> dict[str, list[str]]:

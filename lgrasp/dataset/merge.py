@@ -149,7 +149,7 @@ def _check_manifest(
         ShardError: The manifest is damaged, or a shard is missing, changed, or not in a manifest that is named.
     """
     path = Path(named) if named is not None else folder and folder / MANIFEST
-    manifest = path and read_manifest(path)
+    manifest = None if path is None else read_manifest(path)
     if path is None or manifest is None:
         if named is not None:
             raise ShardError(f"{named}: no manifest there")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from dataclasses import field as with_default
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -203,7 +203,7 @@ class Loader:
         start = time.perf_counter()
         self.report(kind, 0.0)
         arrays, hit = self.cache.get(kind, key, lambda: make().to_arrays())
-        found = model.from_arrays(arrays)
+        found: Model = cast(Any, model).from_arrays(arrays)
         self.hits[kind] = self.hits.get(kind, True) and hit
         self.seconds[kind] = self.seconds.get(kind, 0.0) + time.perf_counter() - start
         return found

@@ -1,6 +1,7 @@
 """pipelines/NAME.yaml: ordered stages with parameters; all of it is in the content keys."""
 
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,11 @@ class Pipeline(_Head):
         """Everything that has parameters and a version: the stages, and ``sequence`` where there is one."""
         stages = tuple((STAGES[name], params) for name, params in self.stages)
         return stages if self.sequence is None else (*stages, (SEQUENCE, self.sequence))
+
+    def import_stages(self) -> None:
+        """Import what the stages run, so that their kernels are compiled before the clock starts."""
+        for stage, _ in self.sections:
+            import_module(stage.module)
 
     def params(self, stage: str) -> Any:
         """Parameters of a stage, or of ``sequence``."""

@@ -276,8 +276,8 @@ def _manifests(
 
 
 def _described(job: Job, array: Array) -> ListedRun:
-    told = {"job": job.command, "unit": job.unit, "lgrasp_version": __version__, "array": array.text or None}
-    return ListedRun(run_key=job.key(), **told, **job.about())
+    told: dict[str, Any] = {"job": job.command, "unit": job.unit, "lgrasp_version": __version__}
+    return ListedRun(run_key=job.key(), array=array.text or None, **told, **job.about())
 
 
 class Todo(NamedTuple):

@@ -58,5 +58,6 @@ class ContactField:
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> "ContactField":
         values: dict[str, Any] = {f.name: arrays[f.name] for f in fields(cls)}
-        scalars = {"cell": float(values["cell"]), "box_edge": float(values["box_edge"])}
-        return cls(**values | {"hand_sha256": str(values["hand_sha256"]), **scalars})
+        values |= {name: float(values[name]) for name in ("cell", "box_edge")}
+        values["hand_sha256"] = str(values["hand_sha256"])
+        return cls(**values)

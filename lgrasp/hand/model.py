@@ -158,6 +158,6 @@ class HandModel:
         text: dict[str, Any] = json.loads(bytes(arrays["text"]))
         tree: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in text.pop("tree").items()}
         tree |= {k.removeprefix("tree."): v for k, v in arrays.items() if k.startswith("tree.")}
-        own = {k: v for k, v in arrays.items() if not k.startswith("tree.") and k != "text"}
+        own: dict[str, Any] = {k: v for k, v in arrays.items() if not k.startswith("tree.") and k != "text"}
         text |= {key: tuple(text[key]) for key in ("notes", "contacts")}
         return cls(tree=Tree(**tree), **own, **text)

@@ -1,7 +1,7 @@
 """Where a thumb is: adducted, it bends more along the palm, as to press on the side of the index finger; abducted, more
 across it, to oppose fingertips."""
 
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def thumb_bends(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[ThumbPlace, Thum
     if np.ptp(angles) < _MIN_RANGE:
         return {}
     middle = round(float(angles.min() + angles.max()) / 2)
-    told = {"link": link, "axis": rounded(axis), "normal": rounded(normal), "angle": middle}
+    told: dict[str, Any] = {"link": link, "axis": rounded(axis), "normal": rounded(normal), "angle": middle}
     return {place: ThumbBend(place=place, **told) for place in get_args(ThumbPlace)}
 
 

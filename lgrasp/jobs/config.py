@@ -181,7 +181,11 @@ def plan_requests(config: JobConfig) -> list[Request]:
             continue
         changes = {name: value for name in ("method", "policy") if (value := getattr(sets, name))}
         own = pipeline.with_params("sequence", **changes) if changes else pipeline
-        what = {"shard_rows": min(config.shard_rows, 1000), "scale": sets.scale, "simulate": sets.simulate}
+        what: dict[str, Any] = {
+            "shard_rows": min(config.shard_rows, 1000),
+            "scale": sets.scale,
+            "simulate": sets.simulate,
+        }
         for hand, names in itertools.product(hands, drawn):
             meshes = tuple(in_folder(config.object_dir, mesh) for mesh in names)
             out = run_folder(config.out, Path(hand).stem, sequence_name(names), pipeline.name, sets.simulate)

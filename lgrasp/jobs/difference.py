@@ -17,7 +17,7 @@ def config_difference(there: Mapping[str, Any], requested: Mapping[str, Any]) ->
     names = [name for name in new if name in old and new[name] != old[name] and name not in _NO_REASON]
     if "pipeline" in names:  # which has other parameters, of course
         names = ["pipeline"]
-    names.sort(key=_LAST.__contains__)
+    names.sort(key=lambda name: name in _LAST)
     words = (_words(name, old[name], new[name]) for name in itertools.islice(names, _MOST_SHOWN))
     more = len(names) - _MOST_SHOWN
     return ", ".join([*words, *([f"{more} more"] if more > 0 else [])])

@@ -56,6 +56,9 @@ def object_record(
 ) -> ObjectRecord:
     """The object, in the user's frame, planes that it rests on, and where it must be touched; its name defaults to
     its id."""
+    regions: dict[str, Any] = {}
+    if steered is not None:
+        regions = {"regions": steered.weights.table(), "touch_share": steered.weights.share}
     return ObjectRecord(
         id=id or obj.name,
         name=obj.name,
@@ -65,7 +68,7 @@ def object_record(
         vertices=obj.vertices,
         faces=obj.faces,
         tables=tables,
-        **({"regions": steered.weights.table(), "touch_share": steered.weights.share} if steered else {}),
+        **regions,
     )
 
 

@@ -68,8 +68,7 @@ class SearchJob(SearchRequest, Job):
 
     def load(self, events: Events, missing: bool) -> None:
         if missing:
-            for stage, _ in self.pipeline.sections:
-                assert stage.run  # imported now, so that its kernels are compiled before the clock starts
+            self.pipeline.import_stages()
         inputs = self.load_inputs(events)
         self._meshes = mesh_blobs(self.keys.source.urdf)
         if missing and self.protocol:

@@ -113,7 +113,7 @@ class Report(JudgedRows):
     @property
     def by_objects(self) -> dict[int, dict[str, float]]:
         """By number of objects held: rows, valid ones, and of these the penetration of hand and objects [mm]."""
-        out = {}
+        out: dict[int, dict[str, float]] = {}
         for held in np.unique(self.held):
             mask = self.held == held
             good = mask & self.valid

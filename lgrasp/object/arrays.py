@@ -1,6 +1,7 @@
 """An ObjectModel on a device, as a Warp struct."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -70,7 +71,7 @@ def upload_object(model: ObjectModel | SteeredObject, device: str, planes: np.nd
         if steered.weights.share < 1.0:
             touch = wp.array(steered.touch.astype(np.int32), dtype=wp.int32, device=device)
     nx, ny, nz = map(int, model.sdf.shape)
-    grid = {"values": model.sdf.ravel(), "least": block_minima(model.sdf)}
+    grid: dict[str, Any] = {"values": model.sdf.ravel(), "least": block_minima(model.sdf)}
     grid |= {"origin": model.sdf_origin, "inv_cell": 1.0 / float(model.sdf_cell)}
     same = {name: getattr(model, name) for name in ("contact_points", "contact_normals", "contact_opposite", "com")}
     others = {

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import ModuleType, TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 from lgrasp.errors import DeviceError
 from lgrasp.files import discard_temporaries
@@ -99,9 +99,9 @@ class Crew:
         links = {link: number for number, link in enumerate(self._links) if number not in self._ended}
         found = []
         for link in wait(list(links), seconds) if links else ():
-            number = links[link]  # type: ignore[index]
+            number = links[cast(Connection, link)]
             try:
-                found.append((number, link.recv()))  # type: ignore[union-attr]
+                found.append((number, self._links[number].recv()))
             except (EOFError, OSError):
                 self._ended.add(number)
                 self._processes[number].join()
@@ -125,8 +125,10 @@ class ProcessPool(ProcessPoolExecutor):
         with spared(), _no_main():  # it starts processes
             return super().submit(fn, *args, **kwargs)
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.shutdown(cancel_futures=kind is not None)
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc_val: BaseException | None, exc_tb: TracebackType | None
+    ) -> None:
+        self.shutdown(cancel_futures=exc_type is not None)
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from enum import IntEnum
+from enum import EnumType, IntEnum
 
 import numpy as np
 import warp as wp
@@ -38,8 +38,8 @@ class Tally(Mapping[str, int]):
 
 def empty_tally(names: Sequence[str] | type[IntEnum], device: str) -> Tally:
     """A tally of zeros; an enumeration counts its members, named in lower case."""
-    if isinstance(names, type):
-        names = [member.name.lower() for member in names]
+    if isinstance(names, EnumType):
+        names = [name.lower() for name in names.__members__]
     return Tally(names, wp.zeros(len(names), dtype=wp.int32, device=device))
 
 

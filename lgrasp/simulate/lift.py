@@ -103,7 +103,7 @@ def course_of(
     closes = len(come) - 1
     closed = np.zeros(((len(stops) - 1) * closing + rest, 3))
     rise = lift.height * smooth(rising)[:, None] * up
-    held = rise[-1] + np.cumsum(np.cumsum(push, axis=0), axis=0) * dt**2
+    held = rise[-1] + push.cumsum(axis=0).cumsum(axis=0) * dt**2
     even = np.arange(1, closing + 1)[:, None] / closing
     close = [a + (b - a) * even for a, b in pairwise(stops)]
     rises = closes + len(closed)

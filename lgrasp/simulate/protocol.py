@@ -214,9 +214,12 @@ class Protocol(Physics):
     @property
     def unfit_for_gpu(self) -> str:
         """What about it runs on the CPU alone; "": nothing."""
-        reasons = {"has random draws, which run": self.draws, "lifts the object, which runs": self.lift}
-        reasons |= {"shakes the hand, which runs": self.shake}
-        return next((words for words, found in reasons.items() if found), "")
+        reasons = (
+            ("has random draws, which run", self.draws),
+            ("lifts the object, which runs", self.lift),
+            ("shakes the hand, which runs", self.shake),
+        )
+        return next((words for words, found in reasons if found), "")
 
     def by(self, engine: EngineName) -> "Protocol":
         """The same in a simulator; its columns are named physics/ENGINE_NAME_... unless that is MuJoCo."""
@@ -251,7 +254,7 @@ class Protocol(Physics):
 
 
 def _protocols() -> dict[str, Protocol]:
-    gravity = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
+    gravity: dict[str, Any] = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
     sequence: dict[str, Any] = {"start": "grasp", "success": "touches", "rest": 0.6, "most_rotation": 180.0}
     sequence |= {"timestep": 1 / 240, **gravity}  # of 1/60 s each step is cut in four
     pulls = 100 / 60  # 100 steps

@@ -161,5 +161,5 @@ class GraspFigure:
         found = {**self.shown.hand.placed(q), **objects}
         for name, mesh in found.items():
             colour = OBJECTS[0] if name in objects else HAND[0]
-            mesh.visual.face_colors = [*rgb(colour), 255]  # type: ignore[union-attr]
+            mesh.visual.face_colors = [*rgb(colour), 255]  # ty: ignore[invalid-assignment]
         return found

@@ -70,7 +70,9 @@ class HandView(View):
         for slider in self._joints:
             slider.on_update(lambda _: self._move())
         opened.on_click(lambda _: self.take(self._tree.joint_open))
-        drawn.on_click(lambda _: self.take(model.random_postures(1, seed=np.random.default_rng().integers(2**31))[0]))
+        drawn.on_click(
+            lambda _: self.take(model.random_postures(1, seed=int(np.random.default_rng().integers(2**31)))[0])
+        )
         add_saving(server, self, model.name)
         self.show("contact patches", True)
         self._move()

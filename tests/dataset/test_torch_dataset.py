@@ -114,7 +114,7 @@ def test_split_by_object(tmp_path, make_shard):
     with pytest.raises(ShardError, match="3 object"):
         data.split(by="object", shares=[1, 1, 1, 1])
     with pytest.raises(ValueError, match="by='row'"):
-        data.split(by="row")  # pyright: ignore[reportArgumentType]
+        data.split(by="row")
     with pytest.raises(ValueError, match="shares are positive"):
         data.split(by="object", shares=(0.5, 0.0))
 

@@ -202,7 +202,7 @@ def test_scene_is_joined(tmp_path):
 
 def test_unknown_parameter_is_refused():
     with pytest.raises(ValueError, match="contact_cout"):
-        ObjectParams(contact_cout=3)  # pyright: ignore[reportCallIssue]
+        ObjectParams(contact_cout=3)
 
 
 def test_find(tmp_path, monkeypatch):

@@ -85,7 +85,11 @@ def _runs(selection: Selection) -> list[dict[str, Any]]:
     for path, rows in selection.sources:
         with ShardReader(path) as reader:
             header = reader.header
-            run = {"hand": str(reader.attributes["hand"]), "objects": reader.object_ids, "pipeline": header.pipeline}
+            run: dict[str, Any] = {
+                "hand": str(reader.attributes["hand"]),
+                "objects": reader.object_ids,
+                "pipeline": header.pipeline,
+            }
             run |= {"seed": header.seed, "lgrasp_version": header.lgrasp_version, "config": dict(header.config)}
         found = runs.setdefault(json.dumps(run, sort_keys=True), run | {"rows": 0, "shards": []})
         found["rows"] += rows

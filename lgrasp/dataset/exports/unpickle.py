@@ -55,14 +55,14 @@ _NAMES = {
 }
 
 
-def _refuse(word: str, _: pickle._Unpickler) -> None:  # pyright: ignore
+def _refuse(word: str, _: pickle._Unpickler) -> None:
     raise UnpickleError(f"it says {word}, which no plain value needs")
 
 
 class _Program(pickle._Unpickler):
     """The words of a pickle; that in Python itself, which makes no room for numbers that a file only says."""
 
-    def find_class(self, module: str, name: str) -> _Noted:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def find_class(self, module: str, name: str) -> _Noted:
         known = _NAMES.get(f"{module} {name}".replace("numpy._core", "numpy.core"))
         if known is None:
             raise UnpickleError(f"it would call {module}.{name}; only numbers, texts, lists and arrays are read")
@@ -77,8 +77,8 @@ class _Program(pickle._Unpickler):
             raise UnpickleError("it builds on something else than a list, dictionary or array")
         self.stack[-1].state = state
 
-    dispatch: ClassVar = {
-        **pickle._Unpickler.dispatch,  # pyright: ignore
+    dispatch: ClassVar[dict[int, Callable[..., None]]] = {
+        **pickle._Unpickler.dispatch,
         **{ord(op.code): partial(_refuse, op.name) for op in pickletools.opcodes if _NEEDLESS.fullmatch(op.name)},
         pickle.BYTEARRAY8[0]: _bytearray,
         pickle.BUILD[0]: _build,

@@ -132,7 +132,7 @@ def read_webdataset(path: Path | str, *, joint_names: Sequence[str] | None = Non
         with parsing(file, "a WebDataset of grasps", wrong), tarfile.open(file, "r:") as tar:
             _check_whole(file)
             for member in tar:
-                entry = json.load(tar.extractfile(member))  # pyright: ignore[reportArgumentType]
+                entry = json.load(tar.extractfile(member))  # ty: ignore[invalid-argument-type]
                 pose, joints = np.array(entry["hand_pose"], float), np.array([entry[n] for n in POSTURES], float)
                 if pose.shape != (7,) or joints.shape != (3, len(listed)) or not pose[3:].any():
                     raise ValueError(f"{member.name} has poses or joints of other lengths")

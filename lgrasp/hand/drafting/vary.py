@@ -111,7 +111,7 @@ def _link_scale(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpec, f
     middle = np.mean(list(_mounts(urdf, tree).values()), axis=0)
     low, high = (tuple((middle + factor * (np.asarray(end) - middle)).tolist()) for end in _ends(spec.canonical_box))
     spaces = {
-        name: OppositionSpace(joints=space.joints, sides=tuple(_grown(s, moving, factor) for s in space.sides))  # type: ignore[arg-type]
+        name: OppositionSpace(joints=space.joints, sides=tuple(_grown(s, moving, factor) for s in space.sides))
         for name, space in spec.opposition_spaces.items()
     }
     return spec.model_copy(update={"canonical_box": Box(min=low, max=high), "opposition_spaces": spaces})

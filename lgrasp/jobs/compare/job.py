@@ -105,7 +105,12 @@ class CompareJob(CompareRequest, Job):
         """Each hand with each object, as the job that makes its grasps."""
         if self._pairs is None:
             pipeline, objects = load_pipeline(self.pipeline).with_seed(self.seed).impatient(), all_objects(self.objects)
-            how = {"rows": self.rows, "shard_rows": self.rows, "device": self.device, "workers": self.workers}
+            how: dict[str, Any] = {
+                "rows": self.rows,
+                "shard_rows": self.rows,
+                "device": self.device,
+                "workers": self.workers,
+            }
             sources = [hand.source for hand in self.compared]
             jobs = [r.job(self.cache) for r in pair_requests(sources, objects, pipeline, self.out, **how)]
             self._pairs = [(self.compared[k // len(objects)], job) for k, job in enumerate(jobs)]
@@ -191,7 +196,7 @@ def make_cell(job: GenerateJob, protocol: ProtocolName | None, key: str, progres
         CancelledError: the job is to stop.
         LgraspError: see the jobs.
     """
-    how = {"device": job.device, "workers": job.workers, "cache": job.cache}
+    how: dict[str, Any] = {"device": job.device, "workers": job.workers, "cache": job.cache}
     told = _Told(progress)
     with temporary_folder() as folder:
         _run(job.changed(out=folder / "grasps"), told)

@@ -116,6 +116,11 @@ def read_examples(
 
 def _bytes(trainer: Trainer, hand: HandModel, key: str, report: dict[str, Any]) -> bytes:
     """The file of a predictor."""
-    card = {"kind": FitJob.kind[0], "version": FitJob.kind[1], "hand": hand.name, "hand_sha256": hand.sha256}
+    card: dict[str, Any] = {
+        "kind": FitJob.kind[0],
+        "version": FitJob.kind[1],
+        "hand": hand.name,
+        "hand_sha256": hand.sha256,
+    }
     card |= {"params": trainer.params.model_dump(mode="json"), "run_key": key, "report": report}
     return network_bytes(card, {name: values.cpu() for name, values in trainer.net.state_dict().items()})

@@ -80,8 +80,7 @@ class PolicyJob(PolicyRequest, FileJob):
     def load(self, events: Events, missing: bool) -> None:
         if not missing:
             return
-        for stage, _ in self.pipeline.sections:
-            assert stage.run  # imported now, so that its kernels are compiled before
+        self.pipeline.import_stages()
         load, alias = Loader(self.cache, self.device_used.alias, events.loading), self.device_used.alias
         model = load.hand(self.keys.source, self.keys.hand, self.pipeline.hand)
         self._hand = upload_hand(model, alias, self.pipeline.hand.thumb)
@@ -134,8 +133,8 @@ class PolicyJob(PolicyRequest, FileJob):
         p, alias = self.params, self.device_used.alias
         obj = upload_object(self._object(number), alias)
         learned = self.learned
-        own = {"bounds": learned.bounds, "realised": learned.realised}
-        context = Context(self._hand, obj, self._field, alias, p.seed, number, **own)
+        parts = self._hand, obj, self._field, alias, p.seed, number
+        context = Context(*parts, bounds=learned.bounds, realised=learned.realised)
         return make_pose_examples(learned, self.pipeline.without("adjust", "close"), context, points, p)
 
     def _object(self, number: int) -> ObjectModel:

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -164,7 +164,7 @@ class _Step:
         start = time.perf_counter()
         hands = HeldHands(before.posture(inputs.hand.tree), before.used, before.pose)
         seed = stage_seed(self._seed, before.steps, "diffuser", wave)
-        how = {"each": each, "seed": seed, "steps": self._params.draws, "pool": self._pool}
+        how: dict[str, Any] = {"each": each, "seed": seed, "steps": self._params.draws, "pool": self._pool}
         drawn = inputs.sampler.draw(hands, held.space, held.free, **how)
         add_seconds(self._result.seconds, {"diffuser": time.perf_counter() - start})
         return drawn

@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -114,7 +115,8 @@ def _loss(
     change: Callable[[Situation], Situation] = lambda situation: situation,
 ) -> torch.Tensor:
     """Mean square of the error of dx/dt over entries that move."""
-    n, like = len(rows), {"generator": draw, "device": rows.device}
+    n = len(rows)
+    like: dict[str, Any] = {"generator": draw, "device": rows.device}
     way = torch.randint(examples.ways, (n,), **like)
     goal, situation = examples.batch(rows, way)
     situation = change(situation)

@@ -17,7 +17,7 @@ _DRAWS_PER_STEP = 5  # uniform numbers of a row and step: acceptance, two switch
 
 
 Evaluate = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
-"""See :meth:`Proposals.evaluate`."""
+"""Of coordinates (N, D), contact points and weights: energies (N, T) and the gradient (N, G) of their sum."""
 
 
 class Chain(NamedTuple):
@@ -33,10 +33,9 @@ class Chain(NamedTuple):
 class Proposals(Protocol):
     """The next state of a chain. Steps are tensors, so that one can be recorded and replayed: () int64."""
 
-    def evaluate(
-        self, x: torch.Tensor, contact: torch.Tensor, weights: torch.Tensor, /
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Energies (N, T) and the gradient (N, G) of their weighted sum at x (N, D)."""
+    @property
+    def evaluate(self) -> Evaluate:
+        """Energies and their gradient."""
         ...
 
     def propose(self, step: torch.Tensor, chain: Chain) -> tuple[torch.Tensor, torch.Tensor]:
@@ -120,7 +119,7 @@ class Annealing:
     Means are per row and coordinate, so that rows do not depend on one another.
 
     Args:
-        evaluate: see :meth:`Proposals.evaluate`; the gradient is by all coordinates.
+        evaluate: the gradient is by all coordinates.
         retract: brings coordinates (N, D) back to valid ones.
         free: (N, D) bool coordinates that may change.
     """
@@ -159,7 +158,7 @@ class Langevin:
     own axes.
 
     Args:
-        evaluate: see :meth:`Proposals.evaluate`; the gradient is by motions (N, G).
+        evaluate: the gradient is by motions (N, G).
         moved: coordinates (N, D) after motions (N, G).
         seed: (N,) int64.
         scale: S of a step: step size times preconditioner, broadcasts to (N, G); 0 keeps a coordinate fixed.
