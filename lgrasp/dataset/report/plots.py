@@ -14,6 +14,7 @@ from lgrasp.dataset.report.quantity import Distribution
 
 MAPS = 12
 
+_LAYOUT = "constrained"
 _INK = "#010203"  # of charts.mplstyle; replaced by currentColor
 _BAR = "#2f86c9"
 _BOUND = "#d55e00"
@@ -37,7 +38,7 @@ def _figure(width: float, height: float) -> Iterator[tuple[Any, Callable[[], str
         return text[text.index("<svg") :].replace(_INK, "currentColor")
 
     with matplotlib.rc_context(fname=str(Path(__file__).with_name("charts.mplstyle"))):
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(width, height), layout=_LAYOUT)
         yield figure, svg
 
 
