@@ -6,14 +6,17 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
 # Python compiles what is imported; compiling every file of every package takes long.
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
-# pip reads the index and unpacks one package at a time; uv takes several at once and installs all pinned versions but
-# torch, which pip finds where the user keeps it. Where uv cannot, pip does it all. Then pip has little to look up.
-# Python 3.11 keeps the setuptools that it has.
+# pip reads the index and unpacks one package at a time; uv takes several at once and installs all pinned versions, torch
+# from where pip finds it. Where uv cannot, pip does it all. Python 3.11 keeps the setuptools that it has.
 INDEX := $(if $(PIP_INDEX_URL),--default-index $(PIP_INDEX_URL))
 UV := $(BIN)/uv pip install --quiet --python $(BIN)/python $(INDEX) -c constraints.txt
+WHEELS := $(VENV)/wheels
+DOWNLOAD := $(BIN)/python -m pip download --quiet --disable-pip-version-check -c constraints.txt --no-deps -d $(WHEELS)
+HAS_TORCH = ls -d $(VENV)/lib/python*/site-packages/torch-$(shell sed -n 's/^torch==//p' constraints.txt)*.dist-info >/dev/null 2>&1
 # The viewer is tested in chromium, where there is one.
 CHROMIUM := $(shell command -v chromium 2>/dev/null)
 BROWSER := playwright greenlet
+PROJECT := --no-build-isolation -e ".[dev,sim$(if $(CHROMIUM),$(comma)browser)]"
 OTHERS := $(filter-out torch setuptools $(if $(CHROMIUM),,$(BROWSER)),$(shell sed -n 's/==.*//p' constraints.txt))
 
 # The first of these that is Python 3.11 or 3.12; or say which: make setup PYTHON=/path/to/python
@@ -37,9 +40,11 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "lgrasp needs Python 3.11 or 3.12; give its path: make setup PYTHON=..." >&2; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) --no-deps torch & torch=$$!; \
+	$(HAS_TORCH) || $(DOWNLOAD) torch & torch=$$!; \
 	$(PIP) --no-deps uv && $(UV) --no-deps $(OTHERS) || $(PIP) --no-deps $(OTHERS) && wait $$torch
-	$(PIP) --no-build-isolation -e ".[dev,sim$(if $(CHROMIUM),$(comma)browser)]"
+	$(HAS_TORCH) || $(UV) --no-deps $(WHEELS)/torch-*.whl || $(PIP) --no-deps $(WHEELS)/torch-*.whl
+	$(UV) $(PROJECT) || $(PIP) $(PROJECT)
+	rm -rf $(WHEELS)
 	@touch $@
 
 demo: setup
