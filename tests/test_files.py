@@ -9,7 +9,8 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from support.sources import parse
+from support.places import ROOT
+from support.sources import modules_with, parse
 
 from lgrasp.errors import OutputError
 from lgrasp.files import (
@@ -140,12 +141,11 @@ WRITTEN_BY_HAND = {
 
 def test_files_are_written_in_one_place():
     """Every file of a user is made by lgrasp.files; a new module that writes says here where to."""
-    root = Path(__file__).parents[1]
     found = set()
-    for path in (*root.glob("lgrasp/**/*.py"), *root.glob("lgrasp_cli/**/*.py")):
+    for path in modules_with("open", "File", *WRITERS):
         for call in ast.walk(parse(path)):
             if isinstance(call, ast.Call) and _writes(call):
-                found.add(path.relative_to(root).as_posix())
+                found.add(path.relative_to(ROOT).as_posix())
     assert found == set(WRITTEN_BY_HAND)
 
 

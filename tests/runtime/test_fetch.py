@@ -1,12 +1,11 @@
 """Copies of device arrays on the host."""
 
 import ast
-from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
-from support.sources import parse
+from support.sources import modules_with, parse
 
 from lgrasp.runtime.fetch import fetch
 
@@ -32,8 +31,8 @@ def test_nothing():
 
 def test_device_arrays_come_to_the_host_in_one_place():
     """Warp's own ``numpy()`` changes the stream of the device for all threads: only tensors on the CPU have it here."""
-    root, found = Path(__file__).parents[2], []
-    for path in (*root.glob("lgrasp/**/*.py"), *root.glob("lgrasp_cli/**/*.py")):
+    found = []
+    for path in modules_with(".numpy("):
         if path.name != "fetch.py":
             calls = [x for x in ast.walk(parse(path)) if isinstance(x, ast.Call)]
             asked = [x.func.value for x in calls if isinstance(x.func, ast.Attribute) and x.func.attr == "numpy"]
