@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from functools import cache
 from typing import Any
 
 import h5py
@@ -43,12 +42,19 @@ def format_problems(file: h5py.File, name: str, form: str, version: str) -> list
 
 def shard_problems(file: h5py.File) -> list[str]:
     """Why a file is no whole shard, or all differences to the schema, one line each; empty when it conforms."""
-    nodes: dict[str, Any] = {"": file}
+    nodes: dict[str, Any] = {}
     return (
         format_problems(file, "grasp shard", FORMAT, FORMAT_VERSION)
         or foreign_problems(file, nodes)
-        or structure_problems(file, nodes)
+        or structure_problems(nodes)
     )
+
+
+def members(file: h5py.File) -> dict[str, Any]:
+    """The groups and datasets of a file that leads to no other, by path; "" is the file."""
+    nodes: dict[str, Any] = {}
+    foreign_problems(file, nodes)
+    return nodes
 
 
 def foreign_problems(file: h5py.File, nodes: dict[str, Any]) -> list[str]:
@@ -58,8 +64,9 @@ def foreign_problems(file: h5py.File, nodes: dict[str, Any]) -> list[str]:
     names that could not be those of files.
 
     Args:
-        nodes: gets the groups and datasets by path.
+        nodes: gets what :func:`members` gives.
     """
+    nodes[""] = file
     todo: list[tuple[str, h5py.Group, int]] = [("", file, 1)]
     while todo:
         path, group, depth = todo.pop()
@@ -68,7 +75,7 @@ def foreign_problems(file: h5py.File, nodes: dict[str, Any]) -> list[str]:
             if name_problem(name):
                 return [f"{here!r}: the name cannot be used: {name_problem(name)}"]
             if group.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
-                return [f"{here}: is a link; a shard holds its own data"]
+                return [f"{here}: is a link; the file must hold its own data"]
             nodes[here] = node = _member(group, name)
             if isinstance(node, h5py.Group):
                 if depth == _MOST_GROUPS:
@@ -89,7 +96,7 @@ def _member(group: h5py.Group, name: str) -> Any:
 def _foreign_data(dataset: h5py.Dataset) -> str:
     made = dataset.id.get_create_plist()
     if made.get_layout() == h5py.h5d.VIRTUAL or made.get_external_count():
-        return "its data are in other files; a shard holds its own data"
+        return "its data are in other files; the file must hold its own data"
     shape, stored = dataset.shape, dataset.id.get_storage_size()
     declared = math.prod(shape) * dataset.dtype.itemsize if shape else 0
     if declared > _EXPANSION * max(stored, 4096):
@@ -97,58 +104,52 @@ def _foreign_data(dataset: h5py.Dataset) -> str:
     return ""
 
 
-def structure_problems(file: h5py.File, nodes: Mapping[str, Any] | None = None) -> list[str]:
+def structure_problems(nodes: Mapping[str, Any]) -> list[str]:
     """All differences between a file and the schema of shards, one line each; empty when it conforms.
 
     Args:
-        nodes: as of :func:`schema_problems`.
+        nodes: :func:`members` of the file.
     """
-    there = file if nodes is None else nodes
     groups = (SEQUENCE_DATASETS, tuple(TABLE_FIELDS.values()))
-    found = [spec for group in groups if any(spec.path in there for spec in group) for spec in group]
+    found = [spec for group in groups if any(spec.path in nodes for spec in group) for spec in group]
     return [
-        *([] if expand(there, "objects/*") else ["objects: no object"]),
-        *schema_problems(file, (*DATASETS, *found), ATTRIBUTES, nodes),
-        *([] if "statistics" in there else ["statistics: missing group"]),
+        *([] if expand(nodes, "objects/*") else ["objects: no object"]),
+        *schema_problems(nodes, (*DATASETS, *found), ATTRIBUTES),
+        *([] if "statistics" in nodes else ["statistics: missing group"]),
     ]
 
 
 def schema_problems(
-    file: h5py.File,
-    datasets: Sequence[DatasetSpec],
-    attributes: Sequence[AttributeSpec],
-    nodes: Mapping[str, Any] | None = None,
+    nodes: Mapping[str, Any], datasets: Sequence[DatasetSpec], attributes: Sequence[AttributeSpec]
 ) -> list[str]:
     """Differences between a file's datasets and attributes and those of a format, one line each.
 
     Args:
-        nodes: all groups and datasets of the file by path, if they are known; to open them is what takes time.
+        nodes: :func:`members` of the file.
     """
     problems: list[str] = []
     dims: dict[str, int] = {}
-    there = file if nodes is None else nodes
-    node = cache(lambda path: there.get(path or "/")) if nodes is None else nodes.get
     for spec in datasets:
-        for path in expand(there, spec.path):
-            if spec.required or node(path) is not None:
-                problems += _dataset_problems(node(path), path, spec, dims)
+        for path in expand(nodes, spec.path):
+            if spec.required or path in nodes:
+                problems += _dataset_problems(nodes.get(path), path, spec, dims)
     for attribute in attributes:
-        for path in expand(there, attribute.path):
-            if (owner := node(path)) is not None:
+        for path in expand(nodes, attribute.path):
+            if (owner := nodes.get(path)) is not None:
                 problems += _attribute_problems(owner.attrs, path, attribute)
     return problems
 
 
-def expand(file: h5py.File | Mapping[str, Any], pattern: str) -> list[str]:
+def expand(nodes: h5py.File | Mapping[str, Any], pattern: str) -> list[str]:
     """The concrete paths of a schema path: ``*`` becomes each member of the group it is in, sorted.
 
     Args:
-        file: or its groups and datasets by path.
+        nodes: a file, or its :func:`members`.
     """
     head, star, tail = pattern.partition("*")
     if not star:
         return [pattern]
-    group = file.get(head.rstrip("/"))
+    group = nodes.get(head.rstrip("/"))
     return [f"{head}{name}{tail}" for name in sorted(group)] if isinstance(group, h5py.Group) else []
 
 
@@ -216,15 +217,11 @@ def text_sha256(file: h5py.File) -> str:
     value and ``path`` to a scalar string dataset's text; paths have no leading slash.
     """
     texts: dict[str, Any] = {}
-
-    def visit(path: str, node: Any) -> None:
+    for path, node in members(file).items():
         for name, value in node.attrs.items():
             texts[f"{path}@{name}"] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         if isinstance(node, h5py.Dataset) and node.shape == () and h5py.check_string_dtype(node.dtype):
             texts[path] = node.asstr()[()]
-
-    visit("", file)
-    file.visititems(visit)
     texts.pop("@text_sha256", None)
     document = json.dumps(texts, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(document.encode()).hexdigest()

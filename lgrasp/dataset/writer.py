@@ -11,7 +11,7 @@ import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.new_shard import new_shard_file
-from lgrasp.dataset.structure import structure_problems, text_sha256
+from lgrasp.dataset.structure import members, structure_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, object_set_sha256
 from lgrasp.grasp.schema import (
@@ -45,7 +45,7 @@ def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
                 dataset[...] = values
         finish(file)
         ids = [o.id for o in shard.objects]
-        problems = structure_problems(file) or [
+        problems = structure_problems(members(file)) or [
             *hand_problems(shard.hand),
             *(problem for record in shard.objects for problem in object_problems(record)),
             *row_problems(rows, shard.hand, ids, lambda name, a, b: columns[name][a:b]),

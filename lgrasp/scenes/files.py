@@ -11,7 +11,7 @@ import numpy as np
 from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.reader import FileReader, reading
-from lgrasp.dataset.structure import format_problems, schema_problems
+from lgrasp.dataset.structure import expand, foreign_problems, format_problems, members, schema_problems
 from lgrasp.dataset.validate import file_problems
 from lgrasp.dataset.writer import create_array, finish, write_models
 from lgrasp.errors import ShardError
@@ -124,13 +124,14 @@ def check_scene(path: str | os.PathLike[str]) -> list[str]:
 
 def _structure_problems(file: h5py.File) -> list[str]:
     """Why a file is no whole scene of a version that this package reads, one line each."""
-    problems = format_problems(file, "scene", FORMAT, FORMAT_VERSION)
+    nodes: dict[str, Any] = {}
+    problems = format_problems(file, "scene", FORMAT, FORMAT_VERSION) or foreign_problems(file, nodes)
     if problems:
         return problems
-    if not isinstance(file.get("objects"), h5py.Group) or not len(file["objects"]):
+    if not expand(nodes, "objects/*"):
         return ["objects: no object"]
-    missing = [f"{name}: missing group" for name in ("hand", *_GROUPS) if name not in file]
-    return missing or schema_problems(file, DATASETS, ATTRIBUTES)
+    missing = [f"{name}: missing group" for name in ("hand", *_GROUPS) if name not in nodes]
+    return missing or schema_problems(nodes, DATASETS, ATTRIBUTES)
 
 
 def scene_cloud(path: Path) -> dict[str, np.ndarray]:
@@ -177,6 +178,6 @@ def write_scene(path: str | os.PathLike[str], scene: SceneRecord) -> None:
         file["grasps"].attrs["tolerance"] = float(scene.grasps.tolerance)
         file.create_group("statistics").attrs.update(dict(scene.statistics))
         finish(file)
-        problems = schema_problems(file, DATASETS, ATTRIBUTES)
+        problems = schema_problems(members(file), DATASETS, ATTRIBUTES)
         if problems:
             raise ShardError(f"cannot write {path}: {problems[0]}")
