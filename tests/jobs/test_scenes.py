@@ -218,6 +218,17 @@ def test_wrong_values_are_found(folder, tmp_path, where, edit, words):
     assert "row 0" in problem
 
 
+def test_a_scene_leads_to_no_other_file(folder, tmp_path):
+    path = tmp_path / "x.h5"
+    path.write_bytes(files(folder)[0].read_bytes())
+    with h5py.File(path, "r+") as file:
+        del file["cloud/points"]
+        file["cloud/points"] = h5py.ExternalLink(str(files(folder)[1]), "/cloud/points")
+    assert check_scene(path) == ["cloud/points: is a link; the file must hold its own data"]
+    with pytest.raises(ShardError, match="is a link"):
+        SceneReader(path)
+
+
 def test_other_files_are_no_scenes(folder, tmp_path):
     shard = next((folder / "grasps").glob("*/*.h5"))
     assert "not a scene (attribute format is 'lgrasp-shard'" in check_scene(shard)[0]
