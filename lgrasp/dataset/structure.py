@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -42,22 +42,25 @@ def format_problems(file: h5py.File, name: str, form: str, version: str) -> list
 
 def shard_problems(file: h5py.File) -> list[str]:
     """Why a file is no whole shard, or all differences to the schema, one line each; empty when it conforms."""
+    return whole_problems(file, "grasp shard", FORMAT, FORMAT_VERSION, structure_problems)
+
+
+def whole_problems(
+    file: h5py.File, name: str, form: str, version: str, structure: Callable[[dict[str, Any]], list[str]]
+) -> list[str]:
+    """Why a file is no whole file of a format, one line each; ``structure`` tells what its :func:`members` lack."""
     nodes: dict[str, Any] = {}
-    return (
-        format_problems(file, "grasp shard", FORMAT, FORMAT_VERSION)
-        or foreign_problems(file, nodes)
-        or structure_problems(nodes)
-    )
+    return format_problems(file, name, form, version) or _foreign_problems(file, nodes) or structure(nodes)
 
 
 def members(file: h5py.File) -> dict[str, Any]:
     """The groups and datasets of a file that leads to no other, by path; "" is the file."""
     nodes: dict[str, Any] = {}
-    foreign_problems(file, nodes)
+    _foreign_problems(file, nodes)
     return nodes
 
 
-def foreign_problems(file: h5py.File, nodes: dict[str, Any]) -> list[str]:
+def _foreign_problems(file: h5py.File, nodes: dict[str, Any]) -> list[str]:
     """What makes a file more than its own bytes, or larger than them: one line, empty when there is nothing.
 
     Links and datasets that lead to other files, groups inside each other without end, sizes that are only declared, and
@@ -210,14 +213,17 @@ _KINDS = {
 """Kinds of attributes: what to call one; kinds of NumPy dtypes, or what reads it, or fails, or gives None."""
 
 
-def text_sha256(file: h5py.File) -> str:
+def text_sha256(nodes: Mapping[str, Any]) -> str:
     """SHA-256 over every attribute (except ``text_sha256``) and every scalar string, which have no HDF5 checksum.
 
     The hash is of the JSON object, sorted keys, no spaces, ASCII escapes, that maps ``path@name`` to an attribute's
     value and ``path`` to a scalar string dataset's text; paths have no leading slash.
+
+    Args:
+        nodes: :func:`members` of the file.
     """
     texts: dict[str, Any] = {}
-    for path, node in members(file).items():
+    for path, node in nodes.items():
         for name, value in node.attrs.items():
             texts[f"{path}@{name}"] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         if isinstance(node, h5py.Dataset) and node.shape == () and h5py.check_string_dtype(node.dtype):

@@ -9,7 +9,7 @@ import numpy as np
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
-from lgrasp.dataset.structure import shard_problems, text_sha256
+from lgrasp.dataset.structure import members, shard_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import object_set_sha256
 
@@ -32,7 +32,7 @@ def file_problems(
         check_heaps(path)
         with open_hdf5(path) as file, reading(path):
             problems = structure(file)
-            if not problems and "text_sha256" in file.attrs and file.attrs["text_sha256"] != text_sha256(file):
+            if not problems and "text_sha256" in file.attrs and file.attrs["text_sha256"] != text_sha256(members(file)):
                 problems = ["/: attributes or texts were changed after writing (text_sha256 differs)"]
         return problems or content(path)
     except ShardError as error:

@@ -43,9 +43,9 @@ def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
             dataset = create_rows(file, name, values.shape, values.dtype, texts.get(name, ""))
             if values.size:
                 dataset[...] = values
-        finish(file)
+        nodes = finish(file)
         ids = [o.id for o in shard.objects]
-        problems = structure_problems(members(file)) or [
+        problems = structure_problems(nodes) or [
             *hand_problems(shard.hand),
             *(problem for record in shard.objects for problem in object_problems(record)),
             *row_problems(rows, shard.hand, ids, lambda name, a, b: columns[name][a:b]),
@@ -142,10 +142,12 @@ def create_rows(file: h5py.File, name: str, shape: Sequence[int], dtype: np.dtyp
     return dataset
 
 
-def finish(file: h5py.File) -> None:
-    """Mark a file as complete; the last write."""
+def finish(file: h5py.File) -> dict[str, Any]:
+    """Mark a file as complete, the last write; its :func:`~lgrasp.dataset.structure.members`."""
+    nodes = members(file)
     file.attrs["complete"] = np.int64(1)
-    file.attrs["text_sha256"] = text_sha256(file)
+    file.attrs["text_sha256"] = text_sha256(nodes)
+    return nodes
 
 
 def create_array(group: h5py.Group, name: str, data: Any, dtype: Any) -> h5py.Dataset:

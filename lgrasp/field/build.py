@@ -108,8 +108,8 @@ def build_field(
     position, point = gather("position", np.float32), gather("point", np.int32)
     setting = np.repeat(np.arange(slots) // groups, [len(p["point"]) for p in parts])[order]
     patch = setting * hand.model.patches + hand.model.contact_patch[point]
-    boxes: dict[str, Any] = box_index(position, patch, slots // groups * hand.model.patches, params)
-    boxes |= opposed_pairs(parts, groups, palm, params.seed)
+    indices: dict[str, Any] = box_index(position, patch, slots // groups * hand.model.patches, params)
+    indices |= opposed_pairs(parts, groups, palm, params.seed)
     return ContactField(
         hand_sha256=hand.model.sha256,
         cell=cell,
@@ -123,7 +123,7 @@ def build_field(
         normal=gather("normal", np.uint16),
         posture=gather("posture", np.uint8),
         clear_share=np.array([p["clear"] for p in parts], np.float32),
-        **boxes,
+        **indices,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.reader import FileReader, reading
-from lgrasp.dataset.structure import expand, foreign_problems, format_problems, members, schema_problems
+from lgrasp.dataset.structure import expand, schema_problems, whole_problems
 from lgrasp.dataset.validate import file_problems
 from lgrasp.dataset.writer import create_array, finish, write_models
 from lgrasp.errors import ShardError
@@ -46,7 +46,7 @@ class SceneReader(FileReader):
     """One open scene."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        super().__init__(path, _structure_problems)
+        super().__init__(path, _problems)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -119,15 +119,15 @@ def read_scene(path: str | os.PathLike[str]) -> SceneRecord:
 
 def check_scene(path: str | os.PathLike[str]) -> list[str]:
     """All problems of a scene, one line each; an empty list means that it conforms. Every byte is read."""
-    return file_problems(path, _structure_problems, lambda path: scene_problems(read_scene(path)))
+    return file_problems(path, _problems, lambda path: scene_problems(read_scene(path)))
 
 
-def _structure_problems(file: h5py.File) -> list[str]:
+def _problems(file: h5py.File) -> list[str]:
     """Why a file is no whole scene of a version that this package reads, one line each."""
-    nodes: dict[str, Any] = {}
-    problems = format_problems(file, "scene", FORMAT, FORMAT_VERSION) or foreign_problems(file, nodes)
-    if problems:
-        return problems
+    return whole_problems(file, "scene", FORMAT, FORMAT_VERSION, _structure_problems)
+
+
+def _structure_problems(nodes: dict[str, Any]) -> list[str]:
     if not expand(nodes, "objects/*"):
         return ["objects: no object"]
     missing = [f"{name}: missing group" for name in ("hand", *_GROUPS) if name not in nodes]
@@ -177,7 +177,6 @@ def write_scene(path: str | os.PathLike[str], scene: SceneRecord) -> None:
         file["views"].attrs.update(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
         file["grasps"].attrs["tolerance"] = float(scene.grasps.tolerance)
         file.create_group("statistics").attrs.update(dict(scene.statistics))
-        finish(file)
-        problems = schema_problems(members(file), DATASETS, ATTRIBUTES)
+        problems = schema_problems(finish(file), DATASETS, ATTRIBUTES)
         if problems:
             raise ShardError(f"cannot write {path}: {problems[0]}")

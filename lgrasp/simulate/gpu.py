@@ -194,7 +194,7 @@ class WorldTrials:
         """
         n, bounds, objects = len(good), self._bounds, len(self._model.object_body)
         pulls, wild_pulls = Pulls.of(n, objects), np.zeros((n, 6), bool)
-        waiting: np.ndarray = np.stack([np.tile(np.flatnonzero(good), 6), np.repeat(np.arange(6), good.sum())], 1)
+        waiting = np.stack([np.tile(np.flatnonzero(good), 6), np.repeat(np.arange(6), good.sum())], 1)
         enough = sum(sim.worlds >= len(waiting) for sim in self._pulled)
         smaller = self._pulled[max(enough - 1, 0) :][::-1]
         sim = smaller.pop()
@@ -205,7 +205,7 @@ class WorldTrials:
         home, first = np.zeros((sim.worlds, *hands.home.shape[1:])), sim.moved(hands.now.qpos, hands.home)
         pull = self._model.forces[:, None] * (AXES @ self._base_rotation.T)[:, None]  # (6, O, 3)
         while True:
-            late: np.ndarray = self._late(pulls)
+            late = self._late(pulls)
             waiting = waiting[~late[waiting[:, 0], waiting[:, 1]]]
             job[(job[:, 0] >= 0) & late[job[:, 0], job[:, 1]]] = -1  # ty: ignore[invalid-argument-type]
             free = np.flatnonzero(job[:, 0] < 0)
