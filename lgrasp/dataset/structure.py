@@ -90,7 +90,7 @@ def _foreign_problems(file: h5py.File, nodes: dict[str, Any]) -> list[str]:
 
 
 def _member(group: h5py.Group, name: str) -> Any:
-    """As ``group[name]``, in half the time."""
+    """As ``group[name]``, in 0.6 of the time."""
     found = h5py.h5o.open(group.id, name.encode())
     kind = {h5py.h5g.GroupID: h5py.Group, h5py.h5d.DatasetID: h5py.Dataset}.get(type(found))
     return kind(found) if kind else group[name]
