@@ -11,9 +11,9 @@ from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.schema import PASS_SHIFT
-from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, join_rows, select_poses, take_rows
+from lgrasp.grasp.tables import CandidateTable, ContactSets, GraspTable, PoseTable, join_rows, select_poses, take_rows
 from lgrasp.hand.model import HandModel
-from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.fetch import fetch, to_numpy
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 from lgrasp.stages.search.params import SearchParams
@@ -25,6 +25,9 @@ Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]
 PASS_BLOCK = 64
 """Candidates that later passes search again before the next ones start: it decides the order of the rows."""
 _BLOCK = 256  # candidates of a block where there is one pass
+_FEWEST_MOVES = 8  # of a pose: where more than one in so many gives grasps, poses drawn anew are as good
+_NUMBERS = 2**31  # of moved poses: those of candidates have as many bits
+_MOVED_SETTINGS = 3  # of shared joints at moved poses: others than those of the pose that was moved rarely help
 
 
 @dataclass
@@ -109,7 +112,8 @@ def run_batch(
     A pure function of its arguments, and of the batch alone: cutting the stream into other batches gives the same rows
     in the same order. With several passes the poses that yielded are searched again, in every block of PASS_BLOCK
     candidates after one another and the best-yielding first; batches are then whole blocks. Rows of pass p have
-    ``p << PASS_SHIFT`` added to the number of their candidate.
+    ``p << PASS_SHIFT`` added to the number of their candidate. Where few poses of a block give grasps, poses near those
+    that do come after it (``close.moves``), their rows as of further passes.
 
     Args:
         search: runs the stages up to search, such as :meth:`GraphCache.run`; None launches them one by one.
@@ -120,15 +124,17 @@ def run_batch(
         meter = Meter(context.device)
         sets = run_stages(pipeline, context, first, count, "search", meter)
     grasps = _run_through(pipeline.order[pipeline.order.index("search") + 1 :], sets, pipeline, context, meter)
-    passes = pipeline.params("search").passes
+    passes, parts = pipeline.params("search").passes, [grasps]
     if passes > 1:
         table = _yielding(sets.candidates, grasps, context.device)
         again = pipeline.order[pipeline.order.index("search") :]
-        parts = [grasps]
         for salt in range(1, passes):
             found = _run_through(again, table, pipeline, context.with_salt(salt), meter)
             parts.append(replace(found, index=found.index + (salt << PASS_SHIFT)))
-        grasps = _by_blocks(join_rows(parts))
+    if pipeline.moves:
+        parts += _near(sets.candidates.poses, grasps, pipeline, context, meter)
+    if len(parts) > 1:
+        grasps = _by_blocks(join_rows(parts), block_size(pipeline))
     return BatchResult(grasps, meter.counts, meter.seconds)
 
 
@@ -145,7 +151,31 @@ def _yielding(table: CandidateTable, grasps: GraspTable, device: str) -> Candida
     return select_poses(table, row[np.lexsort((-number, index // PASS_BLOCK))], device)
 
 
-def _by_blocks(grasps: GraspTable) -> GraspTable:
+def _near(table: PoseTable, grasps: GraspTable, pipeline: Pipeline, context: Context, meter: Meter) -> list[GraspTable]:
+    """Grasps at poses near those that gave some; a block has as many such poses as candidates at most."""
+    from lgrasp.stages.place.near import near_poses  # as stages, where it is used
+
+    most, block = pipeline.moves, block_size(pipeline)
+    index, palm = fetch([table.index, table.palm_point])
+    index = index[: len(table)]
+    at = np.searchsorted(index, np.unique(grasps.index))
+    at = at[(palm[at] >= 0) & (index[at] < _NUMBERS // most)]
+    _, of, number = np.unique(index[at] // block, return_inverse=True, return_counts=True)
+    moves = np.minimum(block // number[of], most)
+    moves[moves < _FEWEST_MOVES] = 0
+    if not moves.any():
+        return []
+    rows, nth = np.repeat(at, moves), np.concatenate([np.arange(n) for n in moves])
+    start = meter.now()
+    poses, counts = near_poses(table, rows, index[rows] * most + nth, pipeline.params("place"), context)
+    meter.add("place", counts, start, meter.now())
+    settings = min(_MOVED_SETTINGS, pipeline.params("close").settings)
+    found = _run_through(pipeline.order[1:], poses, pipeline.with_params("close", settings=settings), context, meter)
+    candidate, nth = np.divmod(found.index, most)
+    return [replace(found, index=candidate + ((pipeline.params("search").passes + nth) << PASS_SHIFT))]
+
+
+def _by_blocks(grasps: GraspTable, size: int) -> GraspTable:
     """Rows in the order of their blocks, within a block as they are: pass by pass."""
-    block = (grasps.index & ((1 << PASS_SHIFT) - 1)) // PASS_BLOCK
+    block = (grasps.index & ((1 << PASS_SHIFT) - 1)) // size
     return take_rows(grasps, np.argsort(block, kind="stable"))

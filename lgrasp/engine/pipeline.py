@@ -77,6 +77,12 @@ class Pipeline(_Head):
         return "ik" in self.order and bool({"adjust", "close"} & {*self.order})
 
     @property
+    def moves(self) -> int:
+        """Poses that are tried near each one that gave grasps, at most; none where stages follow that draw by pass."""
+        ends = "close" in self.order and self.order[-1] == "filter" and self.sequence is None
+        return self.params("close").moves if ends and self.steer.pose is None else 0
+
+    @property
     def on_table(self) -> bool:
         """True if grasps leave room for the table that the object rests on, or for a plane that is asked for."""
         return self.params("place").table or self.steer.above is not None

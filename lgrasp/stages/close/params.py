@@ -33,6 +33,12 @@ class CloseParams(Params):
         le=1024,
         description="Poses that a policy rates per candidate, at most (place.policy_proposals).",
     )
+    moves: int = Field(
+        default=64,
+        ge=0,
+        le=128,
+        description="Where fewer than one pose in eight gives grasps, so many are tried near each that does, at most.",
+    )
     contact_count: int = Field(
         default=8192, ge=64, le=65536, description="Contact points of objects, at least (object.contact_count)."
     )

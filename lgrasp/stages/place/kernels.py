@@ -31,6 +31,17 @@ _PALM_COSINE = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched obje
 
 
 @wp.func
+def no_proposal(proposals_out: ProposedPoses, row: wp.int32, b: wp.int32):
+    """A proposal of nothing, to be filled in; its pose and setting are not written."""
+    for g in range(proposals_out.anchor.shape[2]):
+        proposals_out.anchor[row, b, g] = -1
+    proposals_out.palm_point[row, b] = -1
+    proposals_out.resting[row, b] = -1
+    proposals_out.surface[row, b] = -1
+    proposals_out.rating[row, b] = Rating.HOPELESS
+
+
+@wp.func
 def _aligned(p: wp.vec3, n: wp.vec3, point: wp.vec3, normal: wp.vec3, steer: Steer, state: wp.uint32):
     """Pose that puts object point on p with opposite normals, with a random roll about the normal of those that are
     asked for; and whether there is one."""
@@ -116,6 +127,34 @@ def _draw_resting(obj: Object, state: wp.uint32):
         if pose < 0 and u < obj.resting.upto[k]:
             pose = k
     return pose
+
+
+@wp.func
+def rate_there(
+    hand: Hand,
+    field: Field,
+    obj: Object,
+    params: PlaceValues,
+    policy: Network,
+    groups: wp.int32,
+    T: wp.transform,
+    resting: wp.int32,
+    setting: wp.int32,
+    palm: wp.int32,
+    anchor: wp.array(dtype=wp.int32),
+    state: wp.uint32,
+):
+    """The rating of a pose (:func:`rate_pose`), or a Rating where static links or the table block it."""
+    if not body_clear(hand, obj, 0, wp.transform_inverse(T), params.allowed_penetration):
+        return int(Rating.BLOCKED)
+    plane = resting_plane(obj, T, resting)
+    above = params.min_table_distance
+    if body_height(hand.pieces, 0, wp.transform_identity(), plane, above) < above:
+        return int(Rating.BLOCKED)
+    if params.samples == 0 and policy.rows.shape[0] == 0:
+        return int(Rating.CLEAR)
+    numbers = wp.rand_init(wp.randi(state))
+    return rate_pose(hand, field, obj, params, policy, groups, T, plane, setting, palm, anchor, numbers)
 
 
 @wp.kernel
@@ -206,18 +245,10 @@ def propose_poses(
             rating = Rating.HOPELESS
     if not found:
         rating = Rating.HOPELESS
-    T_object = wp.transform_inverse(T)
     # the same of all proposals: else those that are hard to reach would lose against the others
     resting = _draw_resting(obj, wp.rand_init(seed[0] - SEED_STRIDE, first[0] + row))
-    if rating != Rating.HOPELESS and body_clear(hand, obj, 0, T_object, params.allowed_penetration):
-        rating = Rating.CLEAR
-        plane = resting_plane(obj, T, resting)
-        above = params.min_table_distance
-        if body_height(hand.pieces, 0, wp.transform_identity(), plane, above) < above:
-            rating = Rating.BLOCKED
-        if rating == Rating.CLEAR and (params.samples > 0 or policy.rows.shape[0] > 0):
-            numbers = wp.rand_init(wp.randi(state))
-            rating = rate_pose(hand, field, obj, params, policy, steer.groups, T, plane, setting, palm, anchor, numbers)
+    if rating != Rating.HOPELESS:
+        rating = rate_there(hand, field, obj, params, policy, steer.groups, T, resting, setting, palm, anchor, state)
     proposals_out.pose[row, b] = T
     proposals_out.palm_point[row, b] = palm
     proposals_out.surface[row, b] = i

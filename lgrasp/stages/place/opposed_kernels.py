@@ -11,23 +11,12 @@ from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.transforms import rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.place.kernels import SEED_STRIDE
+from lgrasp.stages.place.kernels import SEED_STRIDE, no_proposal
 from lgrasp.stages.place.structs import PlaceValues, ProposedPoses, Rating
 
 wp.set_module_options(KERNEL_OPTIONS)
 
 _DRAWS = wp.constant(16)  # of two opposite object points and a contact vector of the first side
-
-
-@wp.func
-def no_proposal(proposals_out: ProposedPoses, row: wp.int32, b: wp.int32):
-    """A proposal of nothing, to be filled in; its pose and setting are not written."""
-    for g in range(proposals_out.anchor.shape[2]):
-        proposals_out.anchor[row, b, g] = -1
-    proposals_out.palm_point[row, b] = -1
-    proposals_out.resting[row, b] = -1
-    proposals_out.surface[row, b] = -1
-    proposals_out.rating[row, b] = Rating.HOPELESS
 
 
 @wp.func

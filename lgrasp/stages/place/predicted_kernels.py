@@ -10,8 +10,8 @@ from lgrasp.math.kinematics import vec_dof
 from lgrasp.math.transforms import rotation_between, tangent
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.place.kernels import SEED_STRIDE
-from lgrasp.stages.place.opposed_kernels import clear_of_hand, no_proposal, side_fixed
+from lgrasp.stages.place.kernels import SEED_STRIDE, no_proposal
+from lgrasp.stages.place.opposed_kernels import clear_of_hand, side_fixed
 from lgrasp.stages.place.structs import PlaceValues, ProposedPoses, Rating
 
 wp.set_module_options(KERNEL_OPTIONS)

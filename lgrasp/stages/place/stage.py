@@ -5,16 +5,16 @@ import warp as wp
 from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays
 from lgrasp.grasp.tables import PoseTable
-from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
-from lgrasp.runtime.tally import Tally, empty_tally
+from lgrasp.runtime.tally import Tally
 from lgrasp.stages.context import Context
+from lgrasp.stages.place.choose import best_poses
 from lgrasp.stages.place.favoured import favoured_palm
-from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
+from lgrasp.stages.place.kernels import propose_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed
 from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.predicted_kernels import propose_predicted
-from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses
+from lgrasp.stages.place.structs import PlaceValues, ProposedPoses
 
 VERSION = 10
 
@@ -58,13 +58,7 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     else:
         kernel, asked = propose_predicted, [context.held.struct, context.predicted.struct, values]
     wp.launch(kernel, shape, [hand, field, obj, *asked, *where], [proposals], device=d)
-    chosen, upto = (wp.empty(count, dtype=wp.int32, device=d) for _ in range(2))
-    tally = empty_tally(PlaceCount, d)
-    wp.launch(choose_poses, count, [hand, obj, values, proposals], [chosen, upto, tally.device], device=d)
-    running_sums(upto)
-    table = PoseTable.empty(d, count, groups)
-    wp.launch(take_poses, count, [upto, chosen, first, proposals], [table.struct], device=d)
-    return table, tally
+    return best_poses(proposals, values, first, context)
 
 
 def _shares(params: PlaceParams, field: FieldArrays, *, palm: bool) -> dict[str, float]:

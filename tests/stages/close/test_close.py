@@ -116,7 +116,7 @@ def test_rows_wrap_the_object(power, barrett):
 
 def test_a_policy_learns_and_rates_by_distances_alone(power, barrett):
     """Its examples are poses as they come, and with it many more of them give grasps."""
-    any_pose = power.with_params("place", policy=None, proposals=1)
+    any_pose = power.with_params("place", policy=None, proposals=1).with_params("close", moves=0)
     context = shard_context(any_pose, barrett, 0)
     found = np.unique(run_batch(any_pose, context, 0, 512).grasps.index)
     params = PosePolicyParams.model_validate({"candidates": 512, "draws": 1})
