@@ -25,9 +25,9 @@ Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]
 PASS_BLOCK = 64
 """Candidates that later passes search again before the next ones start: it decides the order of the rows."""
 _BLOCK = 256  # candidates of a block where there is one pass
-_FEWEST_MOVES = 8  # of a pose: where more than one in so many gives grasps, poses drawn anew are as good
+_RARE = 20  # where more than one pose in so many gives grasps, poses drawn anew are as good as moved ones
 _NUMBERS = 2**31  # of moved poses: those of candidates have as many bits
-_MOVED_SETTINGS = 3  # of shared joints at moved poses: others than those of the pose that was moved rarely help
+_MOVED_SETTINGS = 2  # of shared joints at moved poses: others than those of the pose that was moved rarely help
 
 
 @dataclass
@@ -152,7 +152,7 @@ def _yielding(table: CandidateTable, grasps: GraspTable, device: str) -> Candida
 
 
 def _near(table: PoseTable, grasps: GraspTable, pipeline: Pipeline, context: Context, meter: Meter) -> list[GraspTable]:
-    """Grasps at poses near those that gave some; a block has as many such poses as candidates at most."""
+    """Grasps at poses near those that gave some, in blocks where few did."""
     from lgrasp.stages.place.near import near_poses  # as stages, where it is used
 
     most, block = pipeline.moves, block_size(pipeline)
@@ -161,11 +161,10 @@ def _near(table: PoseTable, grasps: GraspTable, pipeline: Pipeline, context: Con
     at = np.searchsorted(index, np.unique(grasps.index))
     at = at[(palm[at] >= 0) & (index[at] < _NUMBERS // most)]
     _, of, number = np.unique(index[at] // block, return_inverse=True, return_counts=True)
-    moves = np.minimum(block // number[of], most)
-    moves[moves < _FEWEST_MOVES] = 0
-    if not moves.any():
+    at = at[number[of] * _RARE <= block]
+    if not len(at):
         return []
-    rows, nth = np.repeat(at, moves), np.concatenate([np.arange(n) for n in moves])
+    rows, nth = np.repeat(at, most), np.tile(np.arange(most), len(at))
     start = meter.now()
     poses, counts = near_poses(table, rows, index[rows] * most + nth, pipeline.params("place"), context)
     meter.add("place", counts, start, meter.now())

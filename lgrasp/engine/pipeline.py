@@ -78,7 +78,7 @@ class Pipeline(_Head):
 
     @property
     def moves(self) -> int:
-        """Poses that are tried near each one that gave grasps, at most; none where stages follow that draw by pass."""
+        """Poses that are tried near each that gave grasps, where few do; none where stages follow that draw by pass."""
         ends = "close" in self.order and self.order[-1] == "filter" and self.sequence is None
         return self.params("close").moves if ends and self.steer.pose is None else 0
 

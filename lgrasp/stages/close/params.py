@@ -34,10 +34,10 @@ class CloseParams(Params):
         description="Poses that a policy rates per candidate, at most (place.policy_proposals).",
     )
     moves: int = Field(
-        default=64,
+        default=24,
         ge=0,
         le=128,
-        description="Where fewer than one pose in eight gives grasps, so many are tried near each that does, at most.",
+        description="Where fewer than one pose in twenty gives grasps, so many are tried near each that does.",
     )
     contact_count: int = Field(
         default=8192, ge=64, le=65536, description="Contact points of objects, at least (object.contact_count)."

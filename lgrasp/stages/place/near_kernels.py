@@ -18,7 +18,7 @@ from lgrasp.steer.cone import in_cone
 wp.set_module_options(KERNEL_OPTIONS)
 
 _DRAWS = wp.constant(256)  # of points, until one is near another
-_AROUND = wp.constant(256.0)  # places before and after a point in the object's order, which has most that are near
+_AROUND = wp.constant(128.0)  # places before and after a point in the object's order, which has most that are near
 
 
 @wp.struct

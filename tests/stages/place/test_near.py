@@ -21,9 +21,9 @@ def power() -> Pipeline:
 
 
 @pytest.fixture(scope="module")
-def mug(load, power):
-    """Few poses of it give grasps."""
-    return shard_context(power, load("mug", power, "barrett"), 0)
+def driver(load, power):
+    """A screwdriver, of which few poses give grasps."""
+    return shard_context(power, load("screwdriver", power, "barrett"), 0)
 
 
 def near(poses, rows, number, power, context):
@@ -31,14 +31,14 @@ def near(poses, rows, number, power, context):
     return table.arrays(), dict(counts)
 
 
-def test_moved_objects_stay_on_the_palm(power, mug):
-    poses = run_stages(power, mug, 0, 64, "place")
+def test_moved_objects_stay_on_the_palm(power, driver):
+    poses = run_stages(power, driver, 0, 64, "place")
     before, rows = poses.arrays(), np.repeat(np.arange(20), 8)
-    after, counts = near(poses, rows, np.arange(len(rows)) + 1000, power, mug)
+    after, counts = near(poses, rows, np.arange(len(rows)) + 1000, power, driver)
     assert counts["tried"] == len(rows)
     assert counts["kept"] == len(after["index"]) > 100
     parent = rows[after["index"] - 1000]
-    hand, obj = mug.hand.model, mug.object.model
+    hand, obj = driver.hand.model, driver.object.model
     palm, surface = after["palm_point"], after["palm_surface"]
     for new, old, points in (
         (palm, before["palm_point"][parent], hand.contact_points),
@@ -55,28 +55,28 @@ def test_moved_objects_stay_on_the_palm(power, mug):
     np.testing.assert_array_equal(after["setting"], before["setting"][parent])
 
 
-def test_a_number_alone_decides_how_a_pose_is_moved(power, mug):
-    poses = run_stages(power, mug, 0, 64, "place")
+def test_a_number_alone_decides_how_a_pose_is_moved(power, driver):
+    poses = run_stages(power, driver, 0, 64, "place")
     rows, number = np.repeat([3, 5], 16), np.arange(32) + 7
-    whole, _ = near(poses, rows, number, power, mug)
-    part, _ = near(poses, rows[20:], number[20:], power, mug)
+    whole, _ = near(poses, rows, number, power, driver)
+    part, _ = near(poses, rows[20:], number[20:], power, driver)
     last = whole["index"] >= number[20]
     np.testing.assert_array_equal(part["pose"], whole["pose"][last])
     assert len(np.unique(whole["pose"], axis=0)) == len(whole["pose"]) > 16
 
 
-def test_grasps_at_moved_poses_follow_those_of_their_block(power, mug):
+def test_grasps_at_moved_poses_follow_those_of_their_block(power, driver):
     size = block_size(power)
-    none = run_batch(power.with_params("close", moves=0), mug, 0, 2 * size).grasps
-    rows = run_batch(power, mug, 0, 2 * size).grasps
+    none = run_batch(power.with_params("close", moves=0), driver, 0, 6 * size).grasps
+    rows = run_batch(power, driver, 0, 6 * size).grasps
     moved, candidate = rows.index >> PASS_SHIFT, rows.index & ((1 << PASS_SHIFT) - 1)
     np.testing.assert_array_equal(candidate // size, np.sort(candidate // size))
     np.testing.assert_array_equal(rows.q[moved == 0], none.q)
     assert set(candidate) == set(none.index)
-    assert len(rows) > 2 * len(none) > 8
+    assert len(rows) > 1.3 * len(none) > 20
     assert len(np.unique(rows.pose, axis=0)) == len(rows)
     # and do not depend on how the stream is cut
-    parts = [grasp_arrays(run_batch(power, mug, first, size).grasps) for first in (0, size)]
+    parts = [grasp_arrays(run_batch(power, driver, first, size).grasps) for first in range(0, 6 * size, size)]
     for name, values in grasp_arrays(rows).items():
         np.testing.assert_array_equal(values, np.concatenate([part[name] for part in parts]), err_msg=name)
 
@@ -84,7 +84,7 @@ def test_grasps_at_moved_poses_follow_those_of_their_block(power, mug):
 def test_where_many_poses_give_grasps_none_is_moved(load, power):
     context = shard_context(power, load("capsule", power, "barrett"), 0)
     rows = run_batch(power, context, 0, 256).grasps
-    assert len(rows) > 256 / 8
+    assert len(rows) > 256 / 20
     assert (rows.index >> PASS_SHIFT == 0).all()
 
 
