@@ -102,6 +102,8 @@ class Pipeline(_Head):
         """Import what the stages run, so that their kernels are compiled before the clock starts."""
         for stage, _ in self.sections:
             import_module(stage.module)
+        if self.moves:
+            import_module("lgrasp.stages.place.near")
 
     def params(self, stage: str) -> Any:
         """Parameters of a stage, or of ``sequence``."""
