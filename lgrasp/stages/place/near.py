@@ -39,7 +39,7 @@ def near_poses(
     )
     shape = len(rows), _PROPOSALS
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
-    values = make_struct(PlaceValues, params, context.bounds, max_com_distance=params.max_com_distance)
+    values = make_struct(PlaceValues, params, context.bounds)
     models = [context.hand.struct, context.field.struct, context.object.struct]
     asked = [values, context.steered.struct, context.networks.reach, parents.struct, moves, context.seed("place", 1)]
     wp.launch(propose_near, shape, [*models, *asked], [proposals], device=d)
