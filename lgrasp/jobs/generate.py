@@ -214,13 +214,19 @@ class GenerateJob(GenerateRequest, SearchJob):
                 f"steer leaves nothing: at none of {counts['place']['tried']:,} poses could hand "
                 f"'{self.keys.source.name}' hold {self.object_name}"
             )
+        few = f"{outcome.rows:,} of {self.rows:,} grasps found"
+        if (passed := last_survivors(counts)) > 2 * outcome.rows > 0:
+            return StarvedError(
+                f"{few}; of {passed:,} that passed, the others are near-duplicates of these: hand "
+                f"'{self.keys.source.name}' has few more for {self.object_name} with pipeline {self.pipeline.name}"
+            )
         stage, words = starving_stage(counts)
         if stage in ("search", "hold") and self.pipeline.bounds.max_unresisted_load < _LOOSE_LOAD:
             words += f"; grasps that resist less: --set bounds.max_unresisted_load={_LOOSE_LOAD}, or --pipeline swift"
         untried = self.pipeline.params("place").policy is None and own_policy(self.pipeline, self.keys.source.name)
         if stage in ("search", "hold") and untried:
             words += f"; likelier poses: --set place.policy={SHIPPED}"
-        return StarvedError(f"{outcome.rows:,} of {self.rows:,} grasps found; stage {stage} is the bottleneck: {words}")
+        return StarvedError(f"{few}; stage {stage} is the bottleneck: {words}")
 
 
 def _near_duplicates(paths: Collection[Path], device: str) -> int:

@@ -1,6 +1,9 @@
 """What a report counts of rows as they are made, and of those in files."""
 
+from lgrasp.engine.events import JobOutcome
 from lgrasp.engine.report import job_report
+from lgrasp.jobs.generate import GenerateJob
+from lgrasp.runtime.device import resolve_device
 
 _COUNTED = ("grasps", "strict", "distinct_poses", "published_count", "force_closure", "negatives", "resting")
 
@@ -11,3 +14,15 @@ def test_rows_in_memory_and_on_disk_count_alike(run, swift):
     assert {name: made[name] for name in _COUNTED} == {name: read[name] for name in _COUNTED}
     assert (made["grasps"], made["negatives"], sum(pose["rows"] for pose in made["resting"])) == (40, 20, 40)
     assert 0 < made["distinct_poses"] <= 40
+
+
+def test_what_stops_a_job_is_told(small_job, tmp_path, monkeypatch):
+    """Few rows that pass, or few that are no near-duplicates of others."""
+    job = GenerateJob(**small_job | {"out": tmp_path})
+    few = JobOutcome(job, resolve_device("cpu"), parts=[], on_disk={0: 20}, starved=True)
+    for passed, words in ((30, "stage filter is the bottleneck"), (500, "of 500 that passed, the others are near-")):
+        counts = {"place": {"tried": 9, "kept": 9}, "filter": {"kept": passed, "contact": 2 * passed}}
+        monkeypatch.setattr(GenerateJob, "report", lambda *_, counts=counts: {"counts": counts})
+        said = str(job.shortfall(few))
+        assert said.startswith("20 of 60 grasps found; ")
+        assert words in said
