@@ -75,11 +75,6 @@ def test_jaws_close_on_a_ball(jaws_and_ball):
 
 
 @pytest.fixture(scope="module")
-def power():
-    return for_hand(load_pipeline("power"), "barrett")
-
-
-@pytest.fixture(scope="module")
 def barrett(load, power):
     return load("capsule", power, "barrett")
 

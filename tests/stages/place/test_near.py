@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lgrasp.engine.batch import block_size, run_batch, run_stages
-from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.shard import shard_context
 from lgrasp.grasp.schema import PASS_SHIFT
 from lgrasp.grasp.tables import grasp_arrays
@@ -13,11 +13,6 @@ from lgrasp.jobs.hands import for_hand
 from lgrasp.stages.place.near import near_poses
 
 MOST = 0.015  # [m] that an object slides, and its point on the palm
-
-
-@pytest.fixture(scope="module")
-def power() -> Pipeline:
-    return for_hand(load_pipeline("power"), "barrett")
 
 
 @pytest.fixture(scope="module")
