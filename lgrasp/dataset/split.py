@@ -14,7 +14,7 @@ from lgrasp.dataset.gather import gather
 from lgrasp.dataset.json_file import JsonFile
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ConfigError, ShardError
-from lgrasp.grasp.schema import POSE_BITS
+from lgrasp.grasp.pose_numbers import pose_numbers
 from lgrasp.seeding import mixed
 
 SHARES = {"train": 0.8, "val": 0.1, "test": 0.1}
@@ -191,7 +191,7 @@ def _first(reader: ShardReader) -> np.ndarray:
 def _pose_numbers(reader: ShardReader, seed: int) -> np.ndarray:
     """A random number for the object of each row and the pose that it was made from, shape [N], uint64."""
     objects = np.array([*(_number(f"{seed}/{sha256}") for _, sha256, _ in reader.object_keys), 0], np.uint64)
-    return mixed(objects[_first(reader)] + mixed(reader.column("candidate") & np.uint64(POSE_BITS)))
+    return mixed(objects[_first(reader)] + mixed(pose_numbers(reader.column("candidate"), reader.header.config)))
 
 
 def _number(text: str) -> int:

@@ -88,11 +88,11 @@ class Cache:
         except OSError as error:
             self.warn(f"cache entry {path} cannot be read ({error.strerror}); rebuilding it")
             return None
-        import numpy as np  # slow to load, and not needed to list
-
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
+            try:
+                arrays = _unpack(data)
+            except SystemError:  # CPython before 3.11.8 and 3.12.2, where threads parse at the same time (gh-106905)
+                arrays = _unpack(data)
             if json.loads(str(arrays.pop(_NAMES))) != sorted(arrays):  # checksums cover members, not their list
                 raise ValueError("members are missing")
             return arrays
@@ -169,3 +169,10 @@ class Cache:
         size = self.kernel_bytes()
         shutil.rmtree(self.root / "kernels", ignore_errors=True)
         return size
+
+
+def _unpack(data: bytes) -> "dict[str, np.ndarray]":
+    import numpy as np  # slow to load, and not needed to list
+
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}

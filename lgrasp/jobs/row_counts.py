@@ -11,8 +11,8 @@ import numpy as np
 from lgrasp.dataset.info import stage_counts
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.grasp.bounds import GraspBounds, stored_bounds
+from lgrasp.grasp.pose_numbers import pose_numbers
 from lgrasp.grasp.records import GraspRows
-from lgrasp.grasp.schema import POSE_BITS
 from lgrasp.runtime.tally import add_counts
 
 PUBLISHED_FSWO = 0.15
@@ -74,7 +74,7 @@ def _count(column: _Column, names: Collection[str], config: Mapping[str, Any], m
         strict=strict_rows(column, config),
         published_count=int(((fingers >= 3) & (fswo**2 < PUBLISHED_FSWO)).sum()),
         closed=int((column("metrics/epsilon") > 0).sum()),
-        distinct_poses=len(np.unique(column("candidate") & POSE_BITS)),
+        distinct_poses=len(np.unique(pose_numbers(column("candidate"), config))),
     )
     if "table/pose" in names:
         found.update(f"pose {k}" for k in column("table/pose").tolist())

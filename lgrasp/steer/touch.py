@@ -73,7 +73,7 @@ def describe_touching(
     ``every`` of which one touches, the direction ``facing`` of the palm if one is asked for, and what is asked.
 
     Args:
-        poses: T_hand_object that are asked for, (T, 7); told if there are at most MOST_POSES.
+        poses: T_hand_object that are asked for, (T, 7); how many, and which if there are at most MOST_POSES.
     """
     group = model.contact_group
 
@@ -85,8 +85,10 @@ def describe_touching(
     told["every"] = [links(group == g) for g in (*must, *([model.groups] if touching.palm else []))]
     if steering.approach:
         told["facing"] = palm_axis(model)[1].tolist()
-    if poses is not None and len(poses) <= MOST_POSES:
-        told["poses"] = poses.round(6).tolist()
+    if poses is not None:
+        told["pose_count"] = len(poses)
+        if len(poses) <= MOST_POSES:
+            told["poses"] = poses.round(6).tolist()
     return told | steering.model_dump(mode="json", include={"grasp_type", "approach", "above"}, exclude_none=True)
 
 

@@ -44,7 +44,7 @@ def runs(monkeypatch):
     return seen
 
 
-def test_yield_and_inputs_go_from_run_to_run(job, runs):
+def test_yield_and_inputs_go_from_run_to_run(job, runs, known_hands):
     with Bench() as several:
         results = several.measure([job(object="tiny", rows=20), job(object="tiny", rows=10)], repeat=2)
         count = len(runs)
@@ -57,7 +57,7 @@ def test_yield_and_inputs_go_from_run_to_run(job, runs):
     assert all(0 < rate < 100 for rate in after)
     assert [r["grasps"] for r in results] == [20, 10]
     assert all(not trial.out.exists() for trial, _ in runs)
-    # only the first run of all made hand, object and field
+    # only the first run of all made object and field
     assert [all(outcome.job.inputs.hits.values()) for _, outcome in runs] == [False] + [True] * (len(runs) - 1)
     assert len(runs) > count
     assert later["build_seconds"] == results[0]["build_seconds"]

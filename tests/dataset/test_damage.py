@@ -59,7 +59,7 @@ def test_bit_flips_anywhere_are_noticed_or_harmless(tmp_path, whole, same_rows):
     good, path = tmp_path / "good.h5", tmp_path / "bad.h5"
     good.write_bytes(whole)
     expected, rng = read_shard(good), random.Random(3)
-    for _ in range(40):
+    for _ in range(25):
         data = bytearray(whole)
         data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
         path.write_bytes(data)

@@ -16,13 +16,18 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
 
 
-@pytest.fixture
-def folder(tmp_path, make_shard):
-    folder = tmp_path / "run"
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, make_shard):
+    folder = tmp_path_factory.mktemp("made")
     for index, (n, shape) in enumerate([(3, {"contacts": 2}), (0, {}), (4100, {"columns": 3, "contacts": 4})]):
         shard = make_shard(n, objects=2, shard_index=index, **({"columns": 2} | shape))
         write_shard(folder / f"{9 - index}.h5", shard)  # file names run against the shard order
     return folder
+
+
+@pytest.fixture
+def folder(tmp_path, made):
+    return shutil.copytree(made, tmp_path / "run")
 
 
 def test_rows_follow_in_shard_order(folder, tmp_path):

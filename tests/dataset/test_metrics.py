@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull
 from support.wrench import cone_forces, epsilon, residual, wrenches
 from typer.testing import CliRunner
 
+from lgrasp.config import parse_model
 from lgrasp.dataset.metrics import mass_frame, row_metrics
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.report.write import read_dataset
@@ -19,6 +20,7 @@ from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run
 from lgrasp.errors import OutputError, ShardError
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.metrics import MetricsJob
 from lgrasp_cli.dataset import app
 
@@ -52,12 +54,14 @@ def grip(shard, o=0):
         yield points.astype(float), normals, mesh
 
 
-@pytest.fixture
-def measured(run, tmp_path):
+@pytest.fixture(scope="module")
+def measured(small_job, tmp_path_factory):
     """Grasps of the pipeline with both metrics."""
-    run(rows=20, shard_rows=20)
-    add_metrics(tmp_path / "out", tmp_path / "more", BOTH, workers=1)
-    (path,) = (tmp_path / "more").glob("*.h5")
+    folder = tmp_path_factory.mktemp("measured")
+    given = small_job | {"rows": 20, "shard_rows": 20, "out": folder / "out"}
+    generate(parse_model(GenerateJob, given, "generate"))
+    add_metrics(folder / "out", folder / "more", BOTH, workers=1)
+    (path,) = (folder / "more").glob("*.h5")
     assert validate_shard(path) == []
     return read_shard(path)
 

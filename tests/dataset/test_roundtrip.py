@@ -16,7 +16,7 @@ from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import pose_matrix
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     n=st.sampled_from([0, 1, 2, 7]),
     joints=st.integers(1, 6),

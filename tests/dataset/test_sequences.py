@@ -154,7 +154,7 @@ def test_space_names_are_unique(path, make_sequence):
         write_shard(path, replace(shard, grasps=replace(shard.grasps, sequence=names)))
 
 
-@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=3, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     counts=st.lists(st.integers(1, 6), min_size=1, max_size=3),
     more=st.lists(st.integers(1, 6), min_size=1, max_size=3),

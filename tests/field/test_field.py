@@ -263,9 +263,9 @@ def test_published_index_equals_brute_force(model):
     patch = np.repeat(np.arange(len(field.patch_first) - 1), np.diff(field.patch_first))[box]
     assert (model.contact_patch[field.point[field.leaf_record]] == patch).all()
     rng = np.random.default_rng(2)
-    rows = rng.choice(field.vectors, 800)
-    q = p[rows] + rng.normal(size=(800, 3)) * np.repeat([0.002, 0.03], 400)[:, None]
-    m = n[rows] + 0.2 * rng.normal(size=(800, 3))
+    rows = rng.choice(field.vectors, 400)
+    q = p[rows] + rng.normal(size=(400, 3)) * np.repeat([0.002, 0.03], 200)[:, None]
+    m = n[rows] + 0.2 * rng.normal(size=(400, 3))
     m /= np.linalg.norm(m, axis=1, keepdims=True)
     group, angle = groups_of(field)[rows], np.radians(11.5)
     found = query_field(upload_field(field, model, "cpu"), group, q, m, angle=angle, index="bvh", seed=5)
@@ -284,8 +284,8 @@ def test_published_index_equals_brute_force(model):
 
 def test_memory_bound_is_kept(model):
     hand = upload_hand(model, "cpu")
-    roomy = build_field(hand, FieldParams(records=20_000, cell=0.006, max_mb=512))
-    tight = build_field(hand, FieldParams(records=20_000, cell=0.003, max_mb=16))
+    roomy = build_field(hand, FieldParams(records=8000, cell=0.006, max_mb=512))
+    tight = build_field(hand, FieldParams(records=8000, cell=0.003, max_mb=16))
     assert roomy.cell == 0.006
     assert tight.cell > 0.003
     assert tight.megabytes <= 16

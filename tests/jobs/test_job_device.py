@@ -19,6 +19,7 @@ from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.jobs.hand_check.check import check_spaces
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.scenes.job import SceneJob
+from lgrasp.planning.params import PlanParams
 from lgrasp.runtime.device import Device, start
 
 OTHER = "other"
@@ -55,7 +56,7 @@ def cold(tmp_path_factory: pytest.TempPathFactory) -> Cache:
 
 
 def test_plan(on_cpu, cold, tmp_path):
-    given = {"hand": "barrett", "object": "tiny", "starts": 3}
+    given = {"hand": "barrett", "object": "tiny", "starts": 2, "params": PlanParams(rolls=8, finalists=2)}
     outcome = run(PlanJob(**given, out=tmp_path / "out", cache=cold))
     assert outcome.rows
     assert on_cpu == []

@@ -31,13 +31,13 @@ from lgrasp.judge.run import judge
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.stages.refine.params import RefineParams
 
-ROWS = 40
+ROWS = 30
 SPOILT = np.arange(ROWS) % 2 == 0
 
 
 @pytest.fixture(scope="module")
 def source(small_job: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A shard of 40 valid grasps of which every second hand was moved by millimetres, with verdicts of a simulator."""
+    """A shard of valid grasps of which every second hand was moved by millimetres, with verdicts of a simulator."""
     folder = tmp_path_factory.mktemp("source")
     made = generate(GenerateJob(**small_job | {"rows": ROWS, "shard_rows": ROWS, "out": folder / "made"}))
     shard = read_shard(made.paths[0])
@@ -223,7 +223,7 @@ def test_the_same_job_gives_the_same_bytes(source, done, refine, tmp_path, raw_g
 
 def test_a_row_does_not_depend_on_the_others(source, done, refine, tmp_path):
     shard = read_shard(source)
-    some = np.array([7, 4, 31, 12])
+    some = np.array([7, 4, 21, 12])
     rows = shard.grasps
     part = replace(rows, **{name: getattr(rows, name)[some] for name in GRASP_FIELDS}, metrics={}, physics={})
     write_shard(tmp_path / "part.h5", replace(shard, grasps=part))
@@ -251,7 +251,7 @@ def test_shards_without_rows_are_left_out(source, cache_root, tmp_path):
 
 def test_a_shard_of_which_no_row_passes_is_empty_and_stays(job, cache_root, tmp_path):
     """It conforms to the format, and is not computed again."""
-    last = generate(job(object="sphere", rows=8, shard_rows=4, out=tmp_path / "made")).paths[1]
+    last = generate(job(object="sphere", rows=4, shard_rows=2, out=tmp_path / "made")).paths[1]
     shard = read_shard(last)
     pose = shard.grasps.object_pose + np.array([0.1, 0, 0, 0, 0, 0, 0], np.float32)
     write_shard(last, replace(shard, grasps=replace(shard.grasps, object_pose=pose)))
@@ -259,15 +259,15 @@ def test_a_shard_of_which_no_row_passes_is_empty_and_stays(job, cache_root, tmp_
     given: dict[str, Any] = {"device": "cpu", "cache": Cache(cache_root)}
     refined = RefineJob(shards=(tmp_path / "made",), out=out, params=params, **given)
     first = run(refined)
-    assert [part.rows for part, _ in first.made_parts] == [4, 4]
-    assert [made.rows for _, made in first.made_parts] == [4, 0]
+    assert [part.rows for part, _ in first.made_parts] == [2, 2]
+    assert [made.rows for _, made in first.made_parts] == [2, 0]
     assert not validate_shard(first.paths[1])
     assert [one["energy"] is None for one in job_report(first)["results"]] == [False, True]
     again = run(refined.changed())
-    assert (again.results, again.present, again.paths) == ([], 4, first.paths)
-    assert len(judge(out).valid) == 4
-    assert merge_shards(first.paths, tmp_path / "all.h5") == 4
-    assert len(GraspDataset(out)) == 4
+    assert (again.results, again.present, again.paths) == ([], 2, first.paths)
+    assert len(judge(out).valid) == 2
+    assert merge_shards(first.paths, tmp_path / "all.h5") == 2
+    assert len(GraspDataset(out)) == 2
     simulated = run(SimulateJob(shards=(out,), protocol=find_protocol("fc"), out=tmp_path / "simulated", **given))
     assert len(simulated.paths) == 2
     job_report(simulated)
@@ -276,7 +276,7 @@ def test_a_shard_of_which_no_row_passes_is_empty_and_stays(job, cache_root, tmp_
 @pytest.mark.parametrize(("name", "share"), [("sphere", 0.85), ("mug", 0.7)])
 def test_grasps_shaken_by_millimetres_are_recovered(job, refine, tmp_path, name, share):
     """The object off by 4 mm an axis: most are valid again, and no invalid row is written."""
-    rows = 30
+    rows = 20
     made = generate(job(object=name, rows=rows, shard_rows=rows, out=tmp_path / "made"))
     shard = read_shard(made.paths[0])
     pose = shard.grasps.object_pose.copy()

@@ -44,13 +44,13 @@ def warnings_of(cache_root):
 @pytest.fixture(scope="module")
 def uninterrupted(small_job, tmp_path_factory):
     folder = tmp_path_factory.mktemp("uninterrupted")
-    generate(GenerateJob(**small_job | {"rows": 80, "workers": 0, "batch": 0, "out": folder}))
+    generate(GenerateJob(**small_job | {"rows": 60, "workers": 0, "batch": 0, "out": folder}))
     return folder
 
 
 @pytest.fixture
 def whole(uninterrupted, tmp_path):
-    """Folder of an uninterrupted run of 80 rows in shards of 20."""
+    """Folder of an uninterrupted run of 60 rows in shards of 20."""
     return Path(shutil.copytree(uninterrupted, tmp_path / "whole"))
 
 
@@ -60,25 +60,25 @@ def test_deleted_shards_are_made_again(run, whole, raw_grasps):
     before = kept[1].stat().st_mtime_ns
     for shard in (0, 2):
         kept[shard].unlink()
-    outcome = run(rows=80, out=whole)
-    assert (outcome.rows, outcome.made, outcome.present) == (80, 40, 40)
+    outcome = run(rows=60, out=whole)
+    assert (outcome.rows, outcome.made, outcome.present) == (60, 40, 20)
     assert [p.name for p in outcome.written] == [kept[0].name, kept[2].name]
     assert kept[1].stat().st_mtime_ns == before
     assert raw_grasps(whole) == expected
 
 
 def test_nothing_to_do(run, whole):
-    again = run(rows=80, out=whole)
-    assert (again.made, again.present, again.rows) == (0, 80, 80)
+    again = run(rows=60, out=whole)
+    assert (again.made, again.present, again.rows) == (0, 60, 60)
     assert sorted(again.paths) == sorted(whole.glob("*.h5"))
     assert not again.written
 
 
 def test_more_rows_later(run, whole, raw_grasps, tmp_path):
     """A last shard that was shorter is made anew, whole ones stay."""
-    run(rows=50)
-    outcome = run(rows=80)
-    assert (outcome.present, outcome.made) == (40, 40)
+    run(rows=30)
+    outcome = run(rows=60)
+    assert (outcome.present, outcome.made) == (20, 40)
     assert raw_grasps(tmp_path / "out") == raw_grasps(whole)
 
 
@@ -99,34 +99,45 @@ def test_no_resume_replaces(run, raw_grasps, tmp_path):
     assert raw_grasps(tmp_path / "out") == before
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "garbage", "header", "rows", "text"])
-def test_damaged_shard(job, warnings_of, whole, raw_grasps, damage):
+@pytest.fixture(scope="module")
+def small_shards(small_job, tmp_path_factory):
+    """Folder of seven shards of ten rows."""
+    folder = tmp_path_factory.mktemp("small")
+    generate(GenerateJob(**small_job | {"rows": 70, "shard_rows": 10, "out": folder}))
+    return folder
+
+
+def test_damaged_shards(job, warnings_of, small_shards, raw_grasps, tmp_path):
     lines, cache = warnings_of
-    expected = raw_grasps(whole)
-    path = sorted(whole.glob("*.h5"))[1]
-    data = bytearray(path.read_bytes())
-    if damage == "truncated":
-        data = data[: len(data) // 2]
-    elif damage == "empty":
-        data = bytearray()
-    elif damage == "garbage":
-        data = bytearray(np.random.default_rng(0).bytes(len(data)))
-    elif damage == "header":
-        data[100:200] = bytes(100)
-    elif damage == "rows":
-        with h5py.File(path) as file:
-            offset = file["grasps/q"].id.get_chunk_info(0).byte_offset
-        data[offset + 5] ^= 0x40
-    else:
-        at = data.index(b"<robot")
-        data[at + 1] ^= 1
-    path.write_bytes(data)
-    outcome = generate(job(rows=80, out=whole, cache=cache))
-    assert outcome.made == 20
-    assert raw_grasps(whole) == expected
-    assert len(lines) == 1
-    assert str(path) in lines[0]
-    assert "\n" not in lines[0]
+    out = Path(shutil.copytree(small_shards, tmp_path / "damaged"))
+    whole, *paths = sorted(out.glob("*.h5"))
+    before = whole.stat().st_mtime_ns
+    for path, damage in zip(paths, ("truncated", "empty", "garbage", "header", "rows", "text"), strict=True):
+        data = bytearray(path.read_bytes())
+        if damage == "truncated":
+            data = data[: len(data) // 2]
+        elif damage == "empty":
+            data = bytearray()
+        elif damage == "garbage":
+            data = bytearray(np.random.default_rng(0).bytes(len(data)))
+        elif damage == "header":
+            data[100:200] = bytes(100)
+        elif damage == "rows":
+            with h5py.File(path) as file:
+                offset = file["grasps/q"].id.get_chunk_info(0).byte_offset
+            data[offset + 5] ^= 0x40
+        else:
+            at = data.index(b"<robot")
+            data[at + 1] ^= 1
+        path.write_bytes(data)
+    outcome = generate(job(rows=70, shard_rows=10, out=out, cache=cache))
+    assert outcome.written == paths
+    assert whole.stat().st_mtime_ns == before
+    assert raw_grasps(out) == raw_grasps(small_shards)
+    assert len(lines) == len(paths)
+    for path in paths:
+        (line,) = [line for line in lines if str(path) in line]
+        assert "\n" not in line
 
 
 def test_shard_of_another_run(run, swift, tmp_path):
@@ -220,11 +231,11 @@ def test_cancelled_run_keeps_whole_shards(job, whole, raw_grasps, tmp_path):
         def cancelled(self):
             return self.asked
 
-    outcome = generate(job(rows=80), Stop())
+    outcome = generate(job(rows=60), Stop())
     assert outcome.cancelled
     assert not outcome.starved
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["allegro-mug-00000.h5", "manifest.json"]
-    generate(job(rows=80))
+    generate(job(rows=60))
     assert raw_grasps(tmp_path / "out") == raw_grasps(whole)
 
 
@@ -241,13 +252,13 @@ def test_cancelled_before_the_first_batch(job, tmp_path):
 def test_killed_at_random_moments(whole, raw_grasps, job, cache_root, tmp_path):
     random = np.random.default_rng(11)
     out = tmp_path / "killed"
-    for _ in range(3):
-        child = Child(out, cache_root, 80)
+    for _ in range(2):
+        child = Child(out, cache_root, 60)
         assert child.begun()
         time.sleep(random.uniform(0.0, 0.6))
         child.kill()
         child.finish()
-    generate(job(rows=80, out=out))
+    generate(job(rows=60, out=out))
     assert raw_grasps(out) == raw_grasps(whole)
     assert listed(out) == listed(whole)
     assert not leftovers(out)
@@ -255,21 +266,21 @@ def test_killed_at_random_moments(whole, raw_grasps, job, cache_root, tmp_path):
 
 def test_killed_while_writing(whole, raw_grasps, job, cache_root, tmp_path):
     out = tmp_path / "killed"
-    assert Child(out, cache_root, 80, dies=True).finish() == -signal.SIGKILL
+    assert Child(out, cache_root, 60, dies=True).finish() == -signal.SIGKILL
     left, mark = sorted(leftovers(out))
     assert left.endswith(".h5.tmp")
     assert mark.endswith(".running.tmp")
     assert workers(out) == []
-    assert [rows for _, rows in listed(out)] == [20, None, None, None]
+    assert [rows for _, rows in listed(out)] == [20, None, None]
     assert len(list(out.glob("*.h5"))) == 1
-    held = out / "allegro-mug-00003.0123456789ab.h5.tmp"  # another process is writing this one
+    held = out / "allegro-mug-00002.0123456789ab.h5.tmp"  # another process is writing this one
     foreign = out / "notes.tmp"
     foreign.touch()
     with open(held, "wb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        generate(job(rows=80, out=out))
+        generate(job(rows=60, out=out))
         assert sorted(leftovers(out)) == sorted([held.name, foreign.name])
-    generate(job(rows=80, out=out))
+    generate(job(rows=60, out=out))
     assert leftovers(out) == [foreign.name]
     assert raw_grasps(out) == raw_grasps(whole)
     assert listed(out) == listed(whole)
@@ -277,7 +288,7 @@ def test_killed_while_writing(whole, raw_grasps, job, cache_root, tmp_path):
 
 def test_processes_share_an_empty_cache(whole, raw_grasps, tmp_path):
     out, cache = tmp_path / "array", tmp_path / "cache"
-    children = [Child(out, cache, 80, task=(task, 2)) for task in range(2)]
+    children = [Child(out, cache, 60, task=(task, 2)) for task in range(2)]
     assert [child.finish() for child in children] == [0, 0]
     assert raw_grasps(out) == raw_grasps(whole)
     assert not leftovers(out)

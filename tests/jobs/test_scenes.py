@@ -21,7 +21,7 @@ from lgrasp.jobs.scenes.job import SceneJob, describe_scenes
 from lgrasp.scenes.files import SceneReader, check_scene, read_scene, scene_cloud, write_scene
 
 OBJECTS = ["box", "sphere", "tiny"]
-SCENES = 3
+SCENES = 2
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ from support.sequences import OBJECTS, small_inputs, small_pipeline
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.events import Events
 from lgrasp.engine.run import run
 from lgrasp.errors import OutputError
 from lgrasp.grasp.sequences import SequenceTable
@@ -215,30 +214,10 @@ def test_files(job):
         assert all(0.06 <= side <= 0.08 for side in sides)
 
 
-def test_array_tasks_and_resume_give_the_same_files(job, tmp_path):
-    whole = {p.name: read_shard(p).grasps for p in run(job()).paths}
-    parts = tmp_path / "parts"
-    for task in (0, 1):
-        run(job(out=parts), array=(task, 2))
-    assert run(job(out=parts)).made == 0
-    for path in parts.glob("*.h5"):
-        np.testing.assert_array_equal(read_shard(path).grasps.q, whole[path.name].q)
-
-
 def test_other_run_is_not_overwritten(job):
     run(job(rows=4))
     with pytest.raises(OutputError, match="another run"):
         run(job(rows=4, objects=("sphere", "mug"), scale="0.06:0.07"))
-
-
-def test_stop(job):
-    class Stop(Events):
-        def cancelled(self):
-            return True
-
-    outcome = run(job(), Stop())
-    assert outcome.cancelled
-    assert not outcome.paths
 
 
 def test_physics_between_steps(pipeline, inputs, job):

@@ -25,6 +25,7 @@ from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, named_object, object_of_shard
 from lgrasp.planning.params import PlanParams
 from lgrasp.runtime.device import resolve_device
+from lgrasp.stages.refine.params import RefineParams
 
 CPU = resolve_device("cpu")
 REAL = ASSETS / "hands" / "allegro"
@@ -60,7 +61,8 @@ def test_rows_are_refined_with_the_hand_in_their_shard(made: Path, cache_root: P
     shard = read_shard(made)
     assert shard.hand.name == "allegro"
     cache = Cache(cache_root, pytest.fail)
-    (done,) = run(RefineJob(shards=(made,), out=tmp_path / "out", device="cpu", cache=cache)).paths
+    params = RefineParams(matching_rounds=1)
+    (done,) = run(RefineJob(shards=(made,), out=tmp_path / "out", params=params, device="cpu", cache=cache)).paths
     assert validate_shard(done) == []
     assert read_shard(done).hand.sha256 == shard.hand.sha256
 

@@ -115,11 +115,6 @@ def test_rows_of_higher_friction_are_not_strict(generate):
     assert json.loads(generate("--set", "bounds.friction=0.8", "--json", "-").out)["strict"] == 0
 
 
-def test_report_on_standard_output(generate):
-    result = generate("--json", "-")
-    assert json.loads(result.out)["grasps"] == 20
-
-
 def test_quiet(generate):
     result = generate("--quiet")
     assert (result.code, result.out, result.err) == (0, "", "")

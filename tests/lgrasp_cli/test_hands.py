@@ -114,7 +114,8 @@ def test_compare_prints_a_line_for_each_hand(cli, jaws, quick, tmp_path):
     assert f"page  {tmp_path / 'out' / 'compare.html'}" in found.out
     hands = json.loads((tmp_path / "found.json").read_text())["hands"]
     assert [hand["all"]["rows"] for hand in hands] == [3, 3]
-    again = json.loads(cli(*given, "--json", "-").out)  # without the variant: its hand is there already
+    told = cli(*given, "--verbose", "--json", tmp_path / "again.json").out  # without the variant, whose hand is there
+    again = json.loads((tmp_path / "again.json").read_text())
     assert (again["made"], again["present"]) == (0, 3)
-    assert ["sphere", "jaws", "3"] in [line.split()[:3] for line in cli(*given, "--verbose").out.splitlines()]
+    assert ["sphere", "jaws", "3"] in [line.split()[:3] for line in told.splitlines()]
     assert "belongs to another run" in cli(*given, "-n", 4).error()

@@ -1,5 +1,5 @@
-"""README, quickstart and the page on steering run as written, but with fewer rows and plain pictures, in an empty
-folder; the first two with what a wheel installs."""
+"""README, quickstart and the page on steering run as written, but with fewer rows, a small contact field, coarse convex
+pieces and plain pictures, in an empty folder; the first two with what a wheel installs."""
 
 import json
 import os
@@ -14,10 +14,17 @@ from pathlib import Path
 import pytest
 import warp as wp
 from support.pictures import PLAIN
-from support.places import ROOT
+from support.places import QUICK, ROOT
+
+from lgrasp.geometry import decompose
 
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-FEWER = {"generate": ("-n", "4"), "render": ("-n", "2")}
+FEWER = {
+    "build-field": ("-p", QUICK),
+    "generate": ("-n", "4", "--set", "field.records=20000"),  # the field of QUICK
+    "render": ("-n", "2"),
+}
+SETTINGS = PLAIN | {"lgrasp.geometry.decompose._TREE_SEARCH": decompose._TREE_SEARCH | {"threshold": 0.05}}
 
 SCRIPT = """
 import json, os, sys
@@ -25,8 +32,8 @@ from importlib import import_module
 import lgrasp
 from lgrasp_cli.main import main
 print(lgrasp.__file__)
-pages, pictures = json.load(sys.stdin)
-for name, value in pictures.items():
+pages, settings = json.load(sys.stdin)
+for name, value in settings.items():
     module, _, attribute = name.rpartition(".")
     assert hasattr(import_module(module), attribute)
     setattr(import_module(module), attribute, value)
@@ -100,7 +107,7 @@ def test_pages_run_with_a_wheel(installed, shared_cache, tmp_path):
     env["WARP_CACHE_PATH"] = str(Path(wp.config.kernel_cache_dir).parent)  # Warp adds its version
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT],
-        input=json.dumps([ran, PLAIN]),
+        input=json.dumps([ran, SETTINGS]),
         env=env,
         cwd=tmp_path,
         capture_output=True,

@@ -18,6 +18,7 @@ from lgrasp.refine.params import LocalSearch
 QUICK = PlanParams(
     rolls=3, finalists=1, opening=2, search=PlanParams().search.model_copy(update={"matching_rounds": 6})
 )
+STARTS = 24
 
 
 @pytest.fixture(scope="module")
@@ -84,21 +85,27 @@ def test_a_start_does_not_depend_on_the_others(planner, planned):
 
 
 @pytest.fixture(scope="module")
-def plan(inputs) -> Callable[..., Planned]:
-    """plan(tried, draws): what is planned of 60 starts, of fewer none may differ."""
+def barrett(load, swift):
+    """A hand of which few starts tell: most of its plans hold, some do not."""
+    return load("mug", swift, "barrett")
+
+
+@pytest.fixture(scope="module")
+def plan(barrett) -> Callable[..., Planned]:
+    """plan(tried, draws): what is planned of all starts, of fewer none may differ."""
 
     @cache
     def plan(tried: int, draws: int = 0) -> Planned:
         several = {"rolls": 12, "finalists": 12, "tried": tried, "hold": HoldTest(draws=draws)}
         params = QUICK.model_copy(update=several)
-        return Planner(inputs.hand, inputs.object.model, 0.12, params).run(60)
+        return Planner(barrett.hand, barrett.object.model, 0.12, params).run(STARTS)
 
     return plan
 
 
 @pytest.mark.parametrize("draws", [0, 4])
-def test_of_several_hands_the_plan_is_one_that_holds_most_often(inputs, plan, draws):
-    tester = HoldTester(inputs.hand, inputs.object, HoldTest(draws=draws))
+def test_of_several_hands_the_plan_is_one_that_holds_most_often(barrett, plan, draws):
+    tester = HoldTester(barrett.hand, barrett.object, HoldTest(draws=draws))
 
     def shares(table):
         found = tester.run(ControlPoses.of(table), 0)
@@ -149,16 +156,16 @@ def test_hands_that_hold_less_often_are_drawn_and_tried_more_often_unless_told()
     assert told.effort(4).bounds == told.bounds
 
 
-def test_hands_that_do_not_hold_as_often_as_is_asked_are_no_plans(inputs, plan):
+def test_hands_that_do_not_hold_as_often_as_is_asked_are_no_plans(barrett, plan):
     """Of each start the best stays a plan if it holds so often, else it is counted; none may be another."""
     params = QUICK.model_copy(update={"rolls": 12, "finalists": 12, "tried": 12, "hold": HoldTest(draws=4)})
     strict = params.model_copy(update={"min_hold_probability": 0.75})
     free = plan(12, 4)
-    planner = Planner(inputs.hand, inputs.object.model, 0.12, strict)
-    asked = planner.run(60, keep_invalid=True)
+    planner = Planner(barrett.hand, barrett.object.model, 0.12, strict)
+    asked = planner.run(STARTS, keep_invalid=True)
     assert 0 < asked.counts[NOT_HELD] == free.counts["kept"] - asked.counts["kept"] < free.counts["kept"]
     assert free.counts[NOT_HELD] == 0
-    found = HoldTester(inputs.hand, inputs.object, params.hold).run(ControlPoses.of(asked.grasps), 0)
+    found = HoldTester(barrett.hand, barrett.object, params.hold).run(ControlPoses.of(asked.grasps), 0)
     valid = asked.grasps.metrics["valid"] == 1
     assert valid.sum() == asked.counts["kept"]
     assert found["hold_success"][valid].all()
@@ -167,5 +174,5 @@ def test_hands_that_do_not_hold_as_often_as_is_asked_are_no_plans(inputs, plan):
     assert lost.sum() == asked.counts[NOT_HELD]
     assert not valid[lost].any()
     untried = strict.model_copy(update={"tried": 0})
-    first = Planner(inputs.hand, inputs.object.model, 0.12, untried).run(20).grasps.index
-    assert (first == [start for start in free.grasps.index if start < 20]).all()  # who tries nothing refuses nothing
+    first = Planner(barrett.hand, barrett.object.model, 0.12, untried).run(12).grasps.index
+    assert (first == [start for start in free.grasps.index if start < 12]).all()  # who tries nothing refuses nothing

@@ -12,8 +12,6 @@ from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.contact_surface import contact_surface
 from lgrasp.hand.palm import palm_axis
 from lgrasp.jobs.shard_inputs import named_hand
-from lgrasp.object.find import find_object
-from lgrasp.object.preprocess import preprocess_object
 from lgrasp.planning.params import PlanParams
 from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import start_poses, tilted
@@ -65,13 +63,13 @@ def test_tilted_directions_lean_by_their_angle_to_all_sides():
     np.testing.assert_allclose(around.sum(0), 0, atol=1e-12)
 
 
-def test_a_hand_without_a_palm_faces_its_box(cache_root):
+def test_a_hand_without_a_palm_faces_its_box(cache_root, load):
     device = resolve_device("cpu")
     source, dclaw = named_hand(Cache(cache_root, pytest.fail), "dclaw", device)
     centre, facing = palm_axis(dclaw)
     np.testing.assert_allclose(facing, [1, 0, 0], atol=0.01)  # fingers along +x
     assert np.linalg.norm(centre) < 0.02
-    ball = preprocess_object(find_object("sphere"))
+    ball = load("sphere").object.model
     assert source.spec.stand_off
     planner = Planner(upload_hand(dclaw, "cpu"), ball, source.spec.stand_off, PlanParams(rolls=6, finalists=2))
     assert len(planner.run(8).grasps) >= 4

@@ -160,7 +160,7 @@ def test_a_network_learns_where_objects_are_held():
     count, com = rng.integers(0, MOST_HITS + 1, (n, 2)), rng.normal(0, 0.03, (n, 3)).astype(np.float32)
     seen = Seen(hits, count, count / 48, com, np.zeros(n, bool), np.zeros((n, 0), np.float32))
     yields = (count.min(1) >= 3) & (com[:, 0] > 0)
-    net, _ = fit_network(seen, yields, PosePolicyParams.model_validate({"epochs": 40, "batch": 256}))
+    net, _ = fit_network(seen, yields, PosePolicyParams.model_validate({"epochs": 20, "batch": 128}))
     found = ranking(rate(net, seen), yields)
     assert found is not None
     assert found > 0.97

@@ -29,10 +29,10 @@ NUMBERS = ("friction", "torsion", "mass", "stiffness", "damping_ratio", "softnes
 
 @pytest.fixture(params=["mujoco", "physx"])
 def fc_random(request):
-    """The protocol with three draws in each simulator."""
+    """The protocol with two draws in each simulator."""
     if request.param == "physx":
         pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
-    return drawing(count=3).by(request.param)
+    return drawing(count=2).by(request.param)
 
 
 def drawing(**draws) -> Protocol:
@@ -113,7 +113,7 @@ def test_holds_in_all_or_some_draws(jaws: Jaws, fc_random):
     assert (strong["directions"] == 1).all()
     assert strong["contact_at_q"] == 2  # at the row's own pose
     slippery = judge(
-        jaws.shard(2.0 / STIFFNESS), fc_random.model_copy(update={"draws": Draws(count=3, friction=(0.0, 0.01))})
+        jaws.shard(2.0 / STIFFNESS), fc_random.model_copy(update={"draws": Draws(count=2, friction=(0.0, 0.01))})
     )
     assert slippery["holds"] == [False]
     assert slippery["share"] == np.float32([0.0])
@@ -136,13 +136,12 @@ def test_rows_stand_alone(jaws: Jaws, fc_random):
     shard = jaws.shard(count=3)
     depth = np.array([0.5, 2.0, 1.2], "f4")[:, None] / np.float32(STIFFNESS)
     rows = Jaws.rows(shard, q_squeeze=shard.grasps.q - depth)
-    one, two = (judge(shard, fc_random, rows=rows, threads=n) for n in (1, 2))
+    one = judge(shard, fc_random, rows=rows, threads=1)
     assert 0 < one["share"].mean() < 1
     last = {name: values[-1:] for name, values in rows.columns().items()}
     turned = {name: values[::-1] for name, values in rows.columns().items()}
-    single, back = (judge(shard, fc_random, rows=replace(rows, **some)) for some in (last, turned))
+    single, back = (judge(shard, fc_random, rows=replace(rows, **some), threads=2) for some in (last, turned))
     for name, values in one.items():
-        np.testing.assert_array_equal(values, two[name], err_msg=name)
         np.testing.assert_array_equal(values[-1:], single[name], err_msg=name)
         np.testing.assert_array_equal(values, back[name][::-1], err_msg=name)
 

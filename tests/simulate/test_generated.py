@@ -17,7 +17,7 @@ from lgrasp.simulate.scene import Scene, scene_of
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
 FC = PROTOCOLS["fc"]
-ROWS = 16
+ROWS = 12
 
 
 @pytest.fixture(scope="module")

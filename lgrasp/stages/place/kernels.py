@@ -5,10 +5,12 @@ import warp as wp
 
 from lgrasp.field.arrays import Field, field_has, field_pair, field_seed
 from lgrasp.grasp.collision import body_clear, body_depth, body_height, resting_plane
+from lgrasp.grasp.predicted import touching_points
 from lgrasp.grasp.structs import Poses
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.kinematics import group_forward
+from lgrasp.math.kinematics import group_forward, vec_dof
 from lgrasp.math.limits import MAX_GROUPS, MAX_JOINTS
+from lgrasp.math.sdf import sdf_gradient
 from lgrasp.math.transforms import random_rotation, rotation_between
 from lgrasp.object.arrays import Object
 from lgrasp.policy.arrays import Network
@@ -27,6 +29,8 @@ _PINCH_TOLERANCE = wp.constant(0.002)  # [m] difference of their distances
 _PINCH_ROLL_SIGMA = wp.constant(0.3)  # [rad] about the roll that brings the first normals together
 _PINCH_MIN_SINE = wp.constant(0.1)  # of a normal to the line; below that any roll is as good
 _CONE_DRAWS = wp.constant(32)  # of points of object and hand whose roll may bring the palm into its cone
+_TOUCH_GAP = wp.constant(0.001)  # [m] of a palm that touches at a pose that is asked for
+_TOUCH_COSINE = wp.constant(float(np.cos(np.radians(30.0))))  # of its normal and the object's
 _PALM_COSINE = wp.constant(float(np.cos(np.radians(14.0))))  # of a pinched object's normal to the palm's
 
 
@@ -130,6 +134,23 @@ def _draw_resting(obj: Object, state: wp.uint32):
 
 
 @wp.func
+def _palm_touch(hand: Hand, obj: Object, steer: Steer, T: wp.transform):
+    """Palm contact that may touch, and does at a pose, and the object point on it; -1, -1: none."""
+    palm, p, n, i = touching_points(hand, obj, T, 0, -1, vec_dof())
+    allowed = bool(False)
+    for k in range(steer.palm_points.shape[0]):
+        allowed = allowed or steer.palm_points[k] == palm
+    if not allowed or i < 0:
+        return int(-1), int(-1)
+    T_object = wp.transform_inverse(T)
+    e = sdf_gradient(obj.sdf, wp.transform_point(T_object, p))
+    facing = -wp.dot(wp.transform_vector(T_object, n), wp.vec3(e[0], e[1], e[2]))
+    if wp.abs(e[3]) > _TOUCH_GAP or facing < _TOUCH_COSINE:
+        return int(-1), int(-1)
+    return palm, i
+
+
+@wp.func
 def rate_there(
     hand: Hand,
     field: Field,
@@ -196,6 +217,7 @@ def propose_poses(
     found = bool(True)
     if steer.poses.shape[0] > 0:
         T = steer.poses[(first[0] + row) % steer.poses.shape[0]]
+        palm, i = _palm_touch(hand, obj, steer, T)
     elif u < params.canonical:
         x = wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
         p = hand.box_low + wp.cw_mul(x, hand.box_high - hand.box_low)

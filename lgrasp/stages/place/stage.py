@@ -16,7 +16,7 @@ from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.predicted_kernels import propose_predicted
 from lgrasp.stages.place.structs import PlaceValues, ProposedPoses
 
-VERSION = 10
+VERSION = 11
 
 
 def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Context) -> tuple[PoseTable, Tally]:

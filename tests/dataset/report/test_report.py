@@ -378,10 +378,13 @@ def test_command(make_shard, tmp_path):
     result = CliRunner().invoke(app, ["report", str(tmp_path / "in"), "-o", str(out), "--json", str(to_json)])
     assert result.exit_code == 0
     assert "4 in 1 shard," in result.stdout
-    assert json.loads(to_json.read_text())["rows"] == 4
+    numbers = json.loads(to_json.read_text())
+    held = numbers["hands"][0]["held"]["1"]
+    assert (numbers["rows"], held["rows"], held["spaces"]) == (4, 4, {})
     text = out.read_text(encoding="utf-8")
+    assert "Objects in the hand" not in text
     printed = CliRunner().invoke(app, ["report", str(tmp_path / "in"), "-o", str(out), "--json", "-"])
-    assert json.loads(printed.stdout) == json.loads(to_json.read_text())
+    assert json.loads(printed.stdout) == numbers
     assert out.read_text(encoding="utf-8") == text
     check_page(text)
     refused = CliRunner().invoke(app, ["report", str(tmp_path / "in"), "-o", str(tmp_path)])

@@ -80,21 +80,12 @@ def test_command_says_how_many_objects(folder, tmp_path):
     assert line.split(maxsplit=4)[4] == "1: 60, 2: 50, 3: 24"
 
 
-def test_one_object_at_a_time_needs_no_section(tmp_path, make_shard):
-    write_shard(tmp_path / "s.h5", make_shard(5))
-    numbers = report_dataset(tmp_path / "s.h5", tmp_path / "r.html")
-    (hand,) = numbers["hands"]
-    assert hand["held"]["1"]["rows"] == 5
-    assert hand["held"]["1"]["spaces"] == {}
-    assert "Objects in the hand" not in (tmp_path / "r.html").read_text(encoding="utf-8")
-
-
 def test_sequences_beside_other_rows(tmp_path, make_shard, make_sequence):
     """Rows of several objects without steps, and of another hand's spaces, are counted where they belong."""
     write_shard(tmp_path / "a.h5", make_shard(9, objects=2, columns=2))
     write_shard(tmp_path / "b.h5", make_sequence((3, 2), joints=4))
     write_shard(tmp_path / "c.h5", make_sequence((4,), joints=4, spaces=2, shard_index=2))
-    held = report_dataset(tmp_path, tmp_path / "r.html")["hands"][0]["held"]
+    held = read_dataset(tmp_path)[0]["hands"][0]["held"]
     several = (read_shard(tmp_path / "a.h5").grasps.object_index >= 0).all(1).sum()
     assert held["2"]["rows"] == several + 2
     assert sum(space["rows"] for space in held["1"]["spaces"].values()) == 7

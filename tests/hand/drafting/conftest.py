@@ -16,6 +16,12 @@ def allegro() -> tuple[HandSpec, list[str]]:
     return draft_spec(ALLEGRO, "drafted")
 
 
+@pytest.fixture
+def no_spaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Opposition spaces, half of the time of a draft, are not looked for."""
+    monkeypatch.setattr("lgrasp.hand.drafting.draft.propose_spaces", lambda *given: ({}, []))
+
+
 @pytest.fixture(scope="session")
 def left(tmp_path_factory: pytest.TempPathFactory) -> HandSpec:
     """Drafted from its mirror image on another base, turned."""

@@ -64,6 +64,7 @@ def test_left_hand_on_another_base(allegro, left):
     assert np.allclose(left.palm.allowed[0].axis, [-x for x in allegro[0].palm.allowed[0].axis], atol=0.05)
 
 
+@pytest.mark.usefixtures("no_spaces")
 def test_prismatic_jaws_face_each_other(tmp_path):
     path = gripper(tmp_path)
     spec, _ = draft_spec(path)
@@ -77,6 +78,7 @@ def test_prismatic_jaws_face_each_other(tmp_path):
     assert spec.canonical_box.min[2] > 0.03
 
 
+@pytest.mark.usefixtures("no_spaces")
 def test_jaws_with_one_drive_get_a_jaw_as_base(tmp_path):
     path = gripper(tmp_path, mimic=True)
     with pytest.raises(HandError, match=r"one drive moves all fingers.*lgrasp hands add"):
@@ -93,6 +95,7 @@ def test_jaws_with_one_drive_get_a_jaw_as_base(tmp_path):
     assert gaps == pytest.approx([0.0, 0.04, 0.1], abs=1e-6)
 
 
+@pytest.mark.usefixtures("no_spaces")
 def test_visual_geometry_stands_in(tmp_path):
     path = gripper(tmp_path, kind="visual")
     with pytest.raises(HandError, match=r"no collision geometry.*lgrasp hands add"):
@@ -106,6 +109,7 @@ def test_one_finger_is_refused(tmp_path):
         draft_spec(fingers(tmp_path, 1))
 
 
+@pytest.mark.usefixtures("no_spaces")
 def test_one_finger_may_close_against_the_palm(tmp_path):
     path = fingers(tmp_path, 2)
     lone = path.read_text().replace(
@@ -132,6 +136,7 @@ def test_mesh_in_millimetres_is_refused_by_its_own_name(tmp_path):
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.usefixtures("no_spaces")
 def test_huge_mesh_is_thinned_and_keeps_its_shape(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=7, radius=0.012)
     ball.export(tmp_path / "tip.stl")
@@ -178,6 +183,7 @@ def test_joints_are_held_inside_their_limits():
     assert held_value(replace(joint, lower=0.2)) == round((0.2 + np.pi) / 2, 4)
 
 
+@pytest.mark.usefixtures("no_spaces")
 def test_a_spread_joint_is_shared_and_no_link_is_stuck_where_joints_are_held():
     """The thumb's opposition carries part of the palm, so it is held, at a value where no links overlap for ever."""
     urdf = ROOT / "hands" / "schunk_svh" / "hand.urdf"

@@ -49,6 +49,7 @@ def test_rules_of_the_known_hand(site):
     assert hand_source("example-robot-data:allegro_right_hand").urdf == source.urdf
 
 
+@pytest.mark.usefixtures("no_spaces")
 def test_rules_are_drafted_once_for_an_unknown_hand(site, tmp_path):
     install(site, "my-grippers", {"robots/two_jaws.urdf": gripper(tmp_path)})
     source = hand_source("my-grippers:two_jaws")

@@ -24,6 +24,8 @@ TURN = (
 )
 MESH = '<geometry><mesh filename="{}"/></geometry>'
 
+pytestmark = pytest.mark.usefixtures("no_spaces")
+
 
 def robot(folder: Path, hand: Path, sides: str, more: str = "") -> Path:
     """A torso with a head and an arm for each letter of ``sides``; every arm carries the hand, its names prefixed."""

@@ -30,6 +30,7 @@ def test_fingers_touch_near_the_surface_point(context, tables, inputs, finger_po
     table = run(tables.place, DomainParams(), context)[0]
     arrays, hand, obj, field = table.arrays(), inputs.hand.model, inputs.object.model, inputs.field.model
     row, group, slot = np.nonzero(np.arange(arrays["q"].shape[2]) < arrays["count"][:, :, None])
+    row, group, slot = row[::4], group[::4], slot[::4]
     assert len(row) > 500
     T = device_matrix(arrays["poses.pose"])[row]
     surface, record = arrays["surface"][row, group, slot], arrays["record"][row, group, slot]

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lgrasp.engine.batch import run_stages
+from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
+from lgrasp.geometry.poses import pose_matrix, user_poses
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.params import PlaceParams
@@ -63,6 +66,27 @@ def test_palm_contact(context, inputs):
     points = R.apply(obj.contact_points[surface]) + arrays["pose"][:, :3]
     np.testing.assert_allclose(points, hand.contact_points[palm], atol=1e-5)
     np.testing.assert_allclose(R.apply(obj.contact_normals[surface]), -hand.contact_normals[palm], atol=1e-4)
+
+
+@pytest.mark.parametrize("away", [0.0, 0.004])
+def test_a_palm_that_touches_at_a_pose_that_is_asked_for(power, load, device_matrix, tmp_path, away):
+    """It is a contact there, unless the object is ``away`` [m] from it."""
+    inputs = load("sphere", power, "barrett")
+    drawn = run_stages(power, shard_context(power, inputs, 0), 0, 40, "place").arrays()
+    hand, obj = inputs.hand.model, inputs.object.model
+    drawn["pose"][:, :3] += away * hand.contact_normals[drawn["palm_point"]]
+    np.save(tmp_path / "poses.npy", pose_matrix(user_poses(drawn["pose"], obj.center)))
+    steered = power.with_steering(pose=tmp_path / "poses.npy")
+    context = shard_context(steered, load("sphere", steered, "barrett"), 0)
+    found = run_stages(steered, context, 0, len(drawn["pose"]), "place").arrays()
+    assert len(found["index"]) > 20
+    asked = device_matrix(drawn["pose"][found["index"]])
+    np.testing.assert_allclose(device_matrix(found["pose"]), asked, atol=1e-5)
+    touching = found["palm_point"] >= 0
+    assert touching.mean() == (away == 0.0)
+    turn = Rotation.from_quat(found["pose"][touching, 3:])
+    at = turn.apply(obj.contact_points[found["palm_surface"][touching]]) + found["pose"][touching, :3]
+    assert (np.linalg.norm(at - hand.contact_points[found["palm_point"][touching]], axis=1) < 0.003).all()
 
 
 @pytest.mark.parametrize("source", ["canonical", "exhaustive", "pinch"])
