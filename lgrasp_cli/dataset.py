@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
-from typer import Option
+from typer import Argument, Option
 
 from lgrasp.choices import FormatName, MetricName
 from lgrasp.words import number, plural
@@ -64,7 +64,7 @@ app.command("validate", hidden=True)(old_name(check, "lgrasp dataset validate", 
 
 @app.command()
 def merge(
-    paths: Shards,
+    paths: Annotated[list[Path], Argument(metavar="SHARDS", help="Shard files, or the folder of a run.")],
     out: Annotated[Path, Option("--out", "-o", help="File to write.")],
     manifest: Annotated[
         Path | None, Option(help="List of shards to check against; by default manifest.json of a single folder.")

@@ -28,6 +28,7 @@ from lgrasp.stages.context import Context
 
 _LEAST_EFFORT = 65_536  # candidates that any shard may try
 _LEAST_PLACED = 65_536  # candidates of which one must be placed where poses are steered, else a shard ends
+_LEAST_TURNS = 64  # of each pose that is asked for, of which one must be placed
 _EFFORT_STEP = 1024  # candidates: what a shard may try is a multiple of it
 _CPU_LARGEST = 1024  # candidates of a batch
 _SLOW_LARGEST = 512  # the same where a candidate takes long (block_size)
@@ -237,7 +238,11 @@ def make_shard(
 
     def search_all() -> None:
         limit = shard_effort(pipeline, rows) if found.count < rows else 0
-        some = min(limit, _LEAST_PLACED) if pipeline.steer.asks else limit  # the same whatever the batches are
+        some = limit  # the same whatever the batches are
+        if pipeline.steer.asks:
+            asked = context.steered.poses
+            turns = _LEAST_PLACED if asked is None else _LEAST_TURNS * len(asked)
+            some = min(limit, _LEAST_PLACED, -(-turns // _EFFORT_STEP) * _EFFORT_STEP)
         search(some)
         if found.count >= rows or not result.counts["place"]["kept"]:
             return

@@ -35,6 +35,7 @@ from lgrasp.policy.names import SHIPPED
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.cores import cores
 from lgrasp.runtime.processes import ProcessPool, none_killed
+from lgrasp.words import plural
 
 _SHARDS_ON_GPU = 4  # at once
 _MOST_WRITERS = 8
@@ -177,6 +178,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         if not outcome.results:
             sums["counts"] |= counted
         wall, both = sums["seconds"]["wall"], made + present
+        if (asked := inputs.steer.poses) is not None:  # the same in every shard
+            both["distinct_poses"] = min(both["distinct_poses"], len(asked))
         rates = {"grasps": "rows", "strict_valid": "strict", "published_count": "published_count"}
         counts = ("strict", "distinct_poses", "published_count")
         planes = inputs.object.planes
@@ -210,9 +213,12 @@ class GenerateJob(GenerateRequest, SearchJob):
             return None
         counts = self.report(outcome)["counts"]
         if self.pipeline.steer.asks and not counts["place"].get("kept", 1):
+            asked = self.inputs.steer.poses
+            poses = (
+                f"{counts['place']['tried']:,} poses" if asked is None else f"{plural(len(asked), 'pose')} of the file"
+            )
             return ConfigError(
-                f"steer leaves nothing: at none of {counts['place']['tried']:,} poses could hand "
-                f"'{self.keys.source.name}' hold {self.object_name}"
+                f"steer leaves nothing: at none of {poses} could hand '{self.keys.source.name}' hold {self.object_name}"
             )
         few = f"{outcome.rows:,} of {self.rows:,} grasps found"
         if (passed := last_survivors(counts)) > 2 * outcome.rows > 0:

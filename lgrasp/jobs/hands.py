@@ -11,6 +11,7 @@ from lgrasp.hand.urdf import read_urdf
 from lgrasp.notices import notice
 from lgrasp.policy.model import read_policy
 from lgrasp.policy.names import SHIPPED, shipped_policy
+from lgrasp.stages.search.params import SearchParams
 from lgrasp.steer.typed import Anatomy, asked_sides, asked_thumb, made_types, typed
 
 _TWO = 2  # contacts that any grasp has
@@ -35,7 +36,10 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
         ConfigError: see :func:`~lgrasp.steer.typed.typed`, :func:`~lgrasp.steer.typed.asked_sides` and
             :func:`~lgrasp.steer.typed.asked_thumb`; a policy that is none, or of another hand.
     """
-    pipeline = _within_reach(_suited(pipeline, hand), hand)
+    return _within_reach(_looked_up(_suited(pipeline, hand), hand), hand)
+
+
+def _looked_up(pipeline: Pipeline, hand: str) -> Pipeline:
     policy, steer = pipeline.params("place").policy, pipeline.steer
     looked_up = steer.grasp_type is not None or steer.thumb is not None or any(steer.sides.values())
     if not looked_up and policy is None:
@@ -73,15 +77,22 @@ def _suited(pipeline: Pipeline, hand: str) -> Pipeline:
 
 
 def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:
-    least = pipeline.bounds.min_contacts
-    if least <= _TWO:
+    least, asked = pipeline.bounds.min_contacts, _TWO
+    if "search" in pipeline.order:
+        numbers = pipeline.params("search").contacts
+        asked = _TWO if numbers == SearchParams.model_fields["contacts"].default else min(numbers)
+    if max(least, asked) <= _TWO:
         return pipeline
     source = hand_source(hand)
-    fingers = build_tree(read_urdf(source.urdf), source.spec).groups
-    most = max(_TWO, fingers + bool(source.spec.palm.links))
+    fingers, palm = build_tree(read_urdf(source.urdf), source.spec).groups, bool(source.spec.palm.links)
+    if asked > max(_TWO, fingers):
+        notice(f"hand '{source.name}': search.contacts is {max(_TWO, fingers)}, not {asked}: its fingers")
+    if "close" in pipeline.order:  # each finger touches once
+        fingers, palm = len(pipeline.steer.fingers) or fingers, palm and pipeline.steer.palm != "no"
+    most = max(_TWO, fingers + palm)
     if least <= most:
         return pipeline
-    notice(f"hand '{source.name}': bounds.min_contacts is {most}, not {least}: its fingers and palm")
+    notice(f"hand '{source.name}': bounds.min_contacts is {most}, not {least}: its fingers{' and palm' * palm}")
     return pipeline.with_bounds(min_contacts=most)
 
 

@@ -1,20 +1,24 @@
 """Object poses that a user gives: a file of them."""
 
 import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ConfigError, short_reason
-from lgrasp.geometry.poses import inverse, pose_from_matrix
+from lgrasp.geometry.poses import canonical, inverse, pose_from_matrix
 
 _UNIT = 1e-3  # of the lengths of quaternions, and of the products of the axes of a matrix
+_DIGITS = 7  # of equal poses
+_FARTHEST = 10.0  # [m] of an object from its hand, along an axis
 
 
 def read_poses(path: Path) -> np.ndarray:
-    """T_hand_object, x y z [m] qw qx qy qz, shape [n, 7]: of a shard's rows, or of a NumPy file or a CSV file with
-    matrices (16 numbers a pose, row by row) or such poses (7); an array T_object_hand of a NumPy file is turned round.
+    """T_hand_object, x y z [m] qw qx qy qz, shape [n, 7], each once: of a shard's rows, or of a NumPy file or a CSV
+    file with matrices (16 numbers a pose, row by row) or such poses (7); an array T_object_hand of a NumPy file is
+    turned round.
 
     Raises:
         ConfigError: the file cannot be read or holds no pose.
@@ -22,7 +26,7 @@ def read_poses(path: Path) -> np.ndarray:
     where = f"steer.pose: {path}"
     try:
         poses, of_hand = _read(path)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ConfigError(f"{where} cannot be read: {short_reason(error)}") from None
     if poses.ndim == 3 and poses.shape[1:] == (4, 4):
         poses = poses.reshape(-1, 16)
@@ -31,6 +35,8 @@ def read_poses(path: Path) -> np.ndarray:
             f"{where} holds {poses.dtype} of shape {poses.shape}; give poses of shape (n, 4, 4) or (n, 7)"
         )
     poses = poses.astype(float)
+    if not (finite := np.isfinite(poses).all(1)).all():
+        raise ConfigError(f"{where}: pose {int(np.argmin(finite))} is not finite")
     if poses.shape[1] == 16:
         T = poses.reshape(-1, 4, 4)
         R = T[:, :3, :3]
@@ -39,10 +45,16 @@ def read_poses(path: Path) -> np.ndarray:
         poses = pose_from_matrix(np.where(good[:, None, None], T, np.eye(4)))
     else:
         good = np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) < _UNIT
-    good &= np.isfinite(poses).all(1)
     if not good.all():
         raise ConfigError(f"{where}: pose {int(np.argmin(good))} is no rotation and translation")
-    return inverse(poses) if of_hand else poses
+    poses = inverse(poses) if of_hand else poses
+    if (away := np.abs(poses[:, :3]).max(1)).max() > _FARTHEST:
+        k = int(np.argmax(away))
+        raise ConfigError(
+            f"{where}: pose {k} is {away[k]:.3g} m away; accepted: up to {_FARTHEST:g} m (are its units m?)"
+        )
+    same = np.column_stack([poses[:, :3], canonical(poses[:, 3:])]).round(_DIGITS)
+    return poses[np.sort(np.unique(same, axis=0, return_index=True)[1])]
 
 
 def _read(path: Path) -> tuple[np.ndarray, bool]:

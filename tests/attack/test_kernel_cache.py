@@ -10,7 +10,7 @@ import pytest
 
 from lgrasp.engine.cache import Cache
 from lgrasp.files import discard_temporaries
-from lgrasp.runtime.kernel_cache import enter, remove_unfinished
+from lgrasp.runtime.kernel_cache import drop_damaged, enter, remove_unfinished
 
 CODE = """
 import importlib
@@ -76,16 +76,19 @@ def double(tmp_path: Path):
     return run
 
 
-def test_damaged_kernels_are_compiled_again(double, tmp_path):
+def test_damaged_kernels_are_compiled_again(double, said, tmp_path):
     cache = tmp_path / "cache"
     assert double(cache, *DAMAGE) == ""
     for name, (suffix, damage) in DAMAGE.items():
         (path,) = cache.rglob(f"wp_{name}_*/*{suffix}")
         damage(path)
-    said = double(cache, *DAMAGE).splitlines()
-    assert len(said) == len(DAMAGE)
-    assert all(line.endswith("is damaged; compiling it again") for line in said)
-    assert double(cache, *DAMAGE) == ""
+    lines = double(cache, *DAMAGE).splitlines()
+    assert len(lines) == len(DAMAGE)
+    assert all(line.endswith("is damaged; compiling it again") for line in lines)
+    (folder,) = cache.glob("kernels/*")
+    drop_damaged(folder)
+    assert said == []
+    assert len(list(folder.glob("wp_*"))) == len(DAMAGE)
     assert not list(cache.rglob("*.tmp"))
 
 

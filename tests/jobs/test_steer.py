@@ -267,13 +267,15 @@ def test_a_plane_is_no_table_to_lift_from(steered, job, swift, tmp_path):
         job(pipeline=lifted.with_steering(above="0,0,1,0.001")).check()
 
 
-def test_poses_out_of_reach_are_told(job, swift, tmp_path, monkeypatch):
-    monkeypatch.setattr("lgrasp.engine.shard._LEAST_PLACED", 1024)
+def test_poses_out_of_reach_are_told(job, swift, tmp_path):
+    """After few turns of each."""
     np.save(tmp_path / "far.npy", [[0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0]])
     far = job(pipeline=swift.with_steering(pose=tmp_path / "far.npy"), rows=20)
-    error = far.shortfall(generate(far))
+    outcome = generate(far)
+    error = far.shortfall(outcome)
+    assert outcome.results[0].candidates == 1024
     assert isinstance(error, ConfigError)
-    assert "at none of" in str(error)
+    assert "at none of 1 pose of the file" in str(error)
 
 
 def test_a_config_steers_every_pipeline():

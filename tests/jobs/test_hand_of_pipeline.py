@@ -1,0 +1,26 @@
+"""What a pipeline asks for that a hand cannot give."""
+
+import pytest
+
+from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.jobs.hands import for_hand
+
+
+def test_more_contacts_than_a_hand_has_fingers_are_told(said):
+    for_hand(load_pipeline("robust").with_params("search", contacts=(5,)), "allegro")
+    assert said == ["hand 'allegro': search.contacts is 4, not 5: its fingers"]
+
+
+@pytest.mark.parametrize("asked", [(2, 5), (4,)])
+def test_contacts_of_all_fingers_are_fine(said, asked):
+    for_hand(load_pipeline("robust").with_params("search", contacts=asked), "allegro")
+    assert said == []
+
+
+def test_a_grasp_type_without_the_palm_needs_its_fingers_alone(said):
+    """Where fingers close, each touches once."""
+    tripod = for_hand(load_pipeline("power").with_steering(grasp_type="tripod"), "barrett")
+    assert tripod.bounds.min_contacts == 3
+    assert said == ["hand 'barrett': bounds.min_contacts is 3, not 5: its fingers"]
+    assert for_hand(load_pipeline("power"), "barrett").bounds.min_contacts == 4
+    assert for_hand(load_pipeline("power").with_steering(grasp_type="tripod"), "allegro").bounds.min_contacts == 5
