@@ -133,7 +133,7 @@ def _show(data: dict[str, Any]) -> list[Block]:
         *([("strict bounds", f"{looser:,} grasps meet only those of the pipeline")] if looser else ()),
         *took(data, "grasps"),
         place(data),
-        following("render" if data["protocol"] else "simulate", data["out"]),
+        *([following("render" if data["protocol"] else "simulate", data["out"])] if data["grasps"] else ()),
     ]
     return [pairs]
 
