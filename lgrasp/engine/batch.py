@@ -16,7 +16,6 @@ from lgrasp.hand.model import HandModel
 from lgrasp.runtime.fetch import fetch, to_numpy
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
-from lgrasp.stages.search.params import SearchParams
 from lgrasp.steer.arrays import SteerArrays
 
 Search = Callable[[Context, int, int], tuple[ContactSets, Meter]]
@@ -90,12 +89,11 @@ def _fitted(stage: str, params: Any, hand: HandModel, steer: SteerArrays) -> Any
     if stage != "search":
         return params
     asked = params.contacts
-    default = asked == SearchParams.model_fields["contacts"].default
-    if hand.contacts and default:
+    if hand.contacts and params.usual_contacts:
         asked = hand.contacts
     touching = np.diff(hand.contact_first).reshape(-1, hand.groups + 1)[:, :-1] > 0
     fingers = int((touching & steer.touching.groups).sum(1).max())
-    if not (default or steer.least or steer.touching.groups.all()) and min(asked) > fingers:
+    if not (params.usual_contacts or steer.least or steer.touching.groups.all()) and min(asked) > fingers:
         raise ConfigError(
             f"steer.links leaves {fingers} fingers of hand '{hand.name}', and search.contacts asks for {min(asked)} or "
             f"more; give --contacts {fingers}, or more links"

@@ -11,7 +11,6 @@ from lgrasp.hand.urdf import read_urdf
 from lgrasp.notices import notice
 from lgrasp.policy.model import read_policy
 from lgrasp.policy.names import SHIPPED, shipped_policy
-from lgrasp.stages.search.params import SearchParams
 from lgrasp.steer.typed import Anatomy, asked_sides, asked_thumb, made_types, typed
 
 _TWO = 2  # contacts that any grasp has
@@ -79,8 +78,8 @@ def _suited(pipeline: Pipeline, hand: str) -> Pipeline:
 def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:
     least, asked = pipeline.bounds.min_contacts, _TWO
     if "search" in pipeline.order:
-        numbers = pipeline.params("search").contacts
-        asked = _TWO if numbers == SearchParams.model_fields["contacts"].default else min(numbers)
+        search = pipeline.params("search")
+        asked = _TWO if search.usual_contacts else min(search.contacts)
     if max(least, asked) <= _TWO:
         return pipeline
     source = hand_source(hand)

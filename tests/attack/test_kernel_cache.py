@@ -51,6 +51,8 @@ def flip(path: Path) -> None:
 
 
 DAMAGE = {
+    "truncated": (".o", lambda path: os.truncate(path, 200)),
+    "empty": (".o", lambda path: os.truncate(path, 0)),
     "flipped": (".o", flip),
     "gone": (".o", Path.unlink),
     "meta": (".meta", lambda path: path.write_text("{")),

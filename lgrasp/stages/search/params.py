@@ -88,3 +88,8 @@ class SearchParams(Params):
     separation: float = Field(
         default=0.12, ge=0, le=3, description="Sets of one pose with the same fingers differ by this [rad]."
     )
+
+    @property
+    def usual_contacts(self) -> bool:
+        """Whether ``contacts`` are those by default, for which a hand's own stand in."""
+        return self.contacts == type(self).model_fields["contacts"].default
