@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.places import QUICK
 
 import lgrasp as lg
 from lgrasp.api import _made
@@ -19,22 +20,22 @@ def _cache(cache_root):
 
 @pytest.fixture(scope="module")
 def grasps(_cache):
-    return lg.generate("allegro", "mug", 12, pipeline="swift", device="cpu", seed=3)
+    return lg.generate("allegro", "sphere", 12, pipeline=QUICK, device="cpu", seed=3)
 
 
 def test_rows_in_memory_are_those_on_disk(grasps, tmp_path):
     assert (len(grasps), len(grasps.q), grasps.header.seed) == (12, 12, 3)
-    pipeline = lg.load_pipeline("swift").model_copy(update={"seed": 3})
-    written = lg.generate("allegro", "mug", 12, pipeline=pipeline, device="cpu", out=tmp_path / "mug")
+    pipeline = lg.load_pipeline(QUICK).model_copy(update={"seed": 3})
+    written = lg.generate("allegro", "sphere", 12, pipeline=pipeline, device="cpu", out=tmp_path / "ball")
     for name, values in grasps.columns().items():
         np.testing.assert_array_equal(values, written.columns()[name], err_msg=name)
-    (file,) = (tmp_path / "mug").glob("*.h5")
+    (file,) = (tmp_path / "ball").glob("*.h5")
     assert lg.validate_shard(file) == []
-    assert len(lg.open(file)) == len(lg.open(tmp_path / "mug")) == 12
+    assert len(lg.open(file)) == len(lg.open(tmp_path / "ball")) == 12
 
 
 def test_steered_rows():
-    steered = lg.generate("allegro", "mug", 5, pipeline="swift", steer={"palm": "no"}, device="cpu")
+    steered = lg.generate("allegro", "sphere", 5, pipeline=QUICK, steer={"palm": "no"}, device="cpu")
     assert not (steered.contact_links == steered.hand.link_names.index("base_link")).any()
     with pytest.raises(lg.LgraspError, match="fingers: index, middle, ring, thumb"):
         lg.generate("allegro", "mug", 5, steer={"fingers": "pinky"}, device="cpu")
@@ -44,7 +45,7 @@ def test_some_of_the_rows(grasps, tmp_path):
     some = grasps[grasps.metrics["gap"] < np.median(grasps.metrics["gap"])]
     assert len(some) == 6
     assert (some.metrics["gap"] < np.median(grasps.metrics["gap"])).all()
-    assert repr(some) == "<6 grasps of mug by allegro, pipeline swift>"
+    assert repr(some) == "<6 grasps of sphere by allegro, pipeline quick>"
     np.testing.assert_array_equal(grasps[[3, 1]].metrics["gap"], grasps.metrics["gap"][[3, 1]])
     assert len(grasps[2:5]) == 3
     read = lg.read_shard(some.save(tmp_path / "some.h5"))
@@ -59,7 +60,7 @@ def test_table(grasps, monkeypatch):
     np.testing.assert_array_equal(table[joints].to_numpy(np.float32), grasps.q)
     np.testing.assert_array_equal(table["object_pose/qz"], grasps.object_pose[:, 0, 6])
     np.testing.assert_array_equal(table["metrics/epsilon"], grasps.metrics["epsilon"])
-    assert set(table["objects"]) == {"mug"}
+    assert set(table["objects"]) == {"sphere"}
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(lg.LgraspError, match="pip install pandas"):
         grasps.to_pandas()
@@ -85,7 +86,7 @@ def test_refine_simulate_judge(grasps):
 
 
 def test_plan():
-    assert 0 < len(lg.plan("allegro", "mug", starts=6, device="cpu")) <= 6
+    assert 0 < len(lg.plan("barrett", "mug", starts=3, device="cpu")) <= 3
 
 
 def test_sequence():

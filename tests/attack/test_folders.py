@@ -56,20 +56,20 @@ def test_what_is_damaged_is_not_drawn(folder, said):
 
 
 def test_a_shard_in_the_place_of_another(run, raw_grasps, cache_root, tmp_path):
-    run(rows=40)
+    run(rows=8, shard_rows=4)
     out = tmp_path / "out"
     whole = raw_grasps(out)
     first, second = sorted(out.glob("*.h5"))
     shutil.copy(first, second)
     said: list[str] = []
-    again = run(rows=40, cache=Cache(cache_root, said.append))
-    assert (again.made, again.present) == (20, 20)
+    again = run(rows=8, shard_rows=4, cache=Cache(cache_root, said.append))
+    assert (again.made, again.present) == (4, 4)
     assert said == [f"{second} holds shard 0, not 1; rebuilding it"]
     assert raw_grasps(out) == whole
 
 
 def test_states_of_files_that_cannot_be_read(run, tmp_path):
-    run(rows=40)
+    run(rows=8, shard_rows=4)
     first, _ = sorted((tmp_path / "out").glob("*.h5"))
     first.unlink()
     first.symlink_to("nowhere")

@@ -10,7 +10,7 @@ import pytest
 
 from lgrasp.engine.cache import Cache
 from lgrasp.files import discard_temporaries
-from lgrasp.runtime.kernel_cache import drop_damaged, enter, remove_unfinished
+from lgrasp.runtime.kernel_cache import drop_damaged, enter, note_checksums, remove_unfinished, usable_folder
 
 CODE = """
 import importlib
@@ -51,11 +51,11 @@ def flip(path: Path) -> None:
 
 
 DAMAGE = {
-    "truncated": (".o", lambda path: os.truncate(path, 200)),
-    "empty": (".o", lambda path: os.truncate(path, 0)),
-    "flipped": (".o", flip),
-    "gone": (".o", Path.unlink),
-    "meta": (".meta", lambda path: path.write_text("{")),
+    "truncated": ("code.o", lambda path: os.truncate(path, 200)),
+    "empty": ("code.o", lambda path: os.truncate(path, 0)),
+    "flipped": ("code.o", flip),
+    "gone": ("code.o", Path.unlink),
+    "meta": ("code.meta", lambda path: path.write_text("{")),
 }
 
 
@@ -63,8 +63,7 @@ DAMAGE = {
 def double(tmp_path: Path):
     """double(cache, *modules): double a number by the kernel of each, in another process; gives its standard error."""
     (tmp_path / "code").mkdir()
-    for name in DAMAGE:
-        (tmp_path / "code" / f"{name}.py").write_text(KERNEL)
+    (tmp_path / "code" / "flipped.py").write_text(KERNEL)
 
     def run(cache: Path, *modules: str) -> str:
         env = {name: value for name, value in os.environ.items() if name != "WARP_CACHE_PATH"}
@@ -80,26 +79,37 @@ def double(tmp_path: Path):
 
 def test_damaged_kernels_are_compiled_again(double, said, tmp_path):
     cache = tmp_path / "cache"
-    assert double(cache, *DAMAGE) == ""
-    for name, (suffix, damage) in DAMAGE.items():
-        (path,) = cache.rglob(f"wp_{name}_*/*{suffix}")
-        damage(path)
-    lines = double(cache, *DAMAGE).splitlines()
-    assert len(lines) == len(DAMAGE)
-    assert all(line.endswith("is damaged; compiling it again") for line in lines)
+    assert double(cache, "flipped") == ""
+    (path,) = cache.rglob("wp_flipped_*/*.o")
+    flip(path)
+    (line,) = double(cache, "flipped").splitlines()
+    assert line.endswith("is damaged; compiling it again")
     (folder,) = cache.glob("kernels/*")
     drop_damaged(folder)
     assert said == []
-    assert len(list(folder.glob("wp_*"))) == len(DAMAGE)
+    assert len(list(folder.glob("wp_*"))) == 1
     assert not list(cache.rglob("*.tmp"))
 
 
-def test_a_folder_that_cannot_be_made(double, tmp_path):
-    (tmp_path / "cache").mkdir()
-    (tmp_path / "cache" / "kernels").write_text("a file where the folder should be")
-    said = double(tmp_path / "cache", "gone")
-    assert said.count("kernels cannot be kept in") == 1
-    assert "--cache-dir" in said
+def test_every_damage_is_seen(said, tmp_path):
+    for name in ("whole", *DAMAGE):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "code.o").write_bytes(bytes(range(256)) * 4)
+        (tmp_path / name / "code.meta").write_text("{}")
+    note_checksums(tmp_path)
+    for name, (file, damage) in DAMAGE.items():
+        damage(tmp_path / name / file)
+    drop_damaged(tmp_path)
+    assert sorted(line.split()[1] for line in said) == sorted(DAMAGE)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+
+
+def test_a_folder_that_cannot_be_made(said, tmp_path):
+    (tmp_path / "kernels").write_text("a file where the folder should be")
+    assert usable_folder(tmp_path / "kernels").is_dir()
+    (line,) = said
+    assert "kernels cannot be kept in" in line
+    assert "--cache-dir" in line
 
 
 KILLED = """

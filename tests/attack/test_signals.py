@@ -14,7 +14,7 @@ from support.forked import start_forked
 from lgrasp.bench.soak.processes import WAYS
 from lgrasp.bench.soak.trials import Soak
 
-TIMES = {"generate": 1, "dataset merge": 1, "simulate": 1}
+TIMES = {"generate": 1, "dataset merge": 1}
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks for processes in /proc")

@@ -19,6 +19,7 @@ from lgrasp.bench.comparison import (
 )
 from lgrasp.bench.page import Published, load_published
 from lgrasp.bench.rate import Bench
+from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_requests
 from lgrasp.jobs.generate import generate
@@ -45,10 +46,11 @@ def runs(monkeypatch):
 
 
 def test_yield_and_inputs_go_from_run_to_run(job, runs, known_hands):
+    given = {"object": "tiny", "pipeline": load_pipeline(QUICK)}
     with Bench() as several:
-        results = several.measure([job(object="tiny", rows=20), job(object="tiny", rows=10)], repeat=2)
+        results = several.measure([job(**given, rows=20), job(**given, rows=10)], repeat=2)
         count = len(runs)
-        (later,) = several.measure([job(object="tiny", rows=5)], repeat=1)
+        (later,) = several.measure([job(**given, rows=5)], repeat=1)
     trials = [(trial.rows, trial.rate) for trial, _ in runs[:count]]
     after = [outcome.job.measured_rate for _, outcome in runs[:count]]
     # two probes, then the jobs in turns; each begins with what the run before of the same job measured

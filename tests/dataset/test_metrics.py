@@ -95,12 +95,12 @@ def test_stored_residuals(measured):
 
 def test_what_the_rows_show_together(run, tmp_path):
     """The report has coverage and diversity of all shards of an object, as the report of the data set."""
-    run(rows=20, shard_rows=10)
+    run(rows=10, shard_rows=5)
     outcome = add_metrics(tmp_path / "out", tmp_path / "more", ["volume"], workers=1)
     (found,) = job_report(outcome)["sets"]
     (hand,) = read_dataset(tmp_path / "more")[0]["hands"]
     (group,) = hand["objects"]
-    assert (found["hand"], found["objects"], found["rows"]) == ("allegro", ["mug"], 20)
+    assert (found["hand"], found["objects"], found["rows"]) == ("allegro", ["mug"], 10)
     assert found["diversity"] == group["diversity"]
     assert found["coverage"]["mug"]["surface"] == group["coverage"]["mug"]["surface"]
     assert 0 < found["coverage"]["mug"]["surface"]["share"] < 1
@@ -108,13 +108,13 @@ def test_what_the_rows_show_together(run, tmp_path):
 
 
 def test_all_else_stays(tmp_path, make_shard, same_rows):
-    shard = make_shard(70, contacts=5)
+    shard = make_shard(20, contacts=5)
     write_shard(tmp_path / "in" / "a.h5", shard)
     with h5py.File(tmp_path / "in" / "a.h5", "r+") as file:
         file["mine/numbers"] = np.arange(3)
         del file.attrs["text_sha256"]
     added = add_metrics(tmp_path / "in", tmp_path / "out", ["volume"], workers=1)
-    assert (added.paths, added.written, added.made) == ([tmp_path / "out" / "a.h5"],) * 2 + (70,)
+    assert (added.paths, added.written, added.made) == ([tmp_path / "out" / "a.h5"],) * 2 + (20,)
     assert validate_shard(tmp_path / "out" / "a.h5") == []
     new = read_shard(tmp_path / "out" / "a.h5")
     assert new.grasps.metric_units["volume"] == ""
@@ -134,11 +134,11 @@ def test_all_else_stays(tmp_path, make_shard, same_rows):
 
 def test_processes_change_nothing(tmp_path, make_shard):
     for i in range(3):
-        write_shard(tmp_path / "in" / f"{i}.h5", make_shard([12, 0, 3][i], contacts=5, shard_index=i))
+        write_shard(tmp_path / "in" / f"{i}.h5", make_shard([6, 0, 3][i], contacts=5, shard_index=i))
     watch = Watch()
     add_metrics(tmp_path / "in", tmp_path / "one", BOTH, watch, workers=1)
     add_metrics(tmp_path / "in", tmp_path / "two", BOTH, workers=2)
-    assert watch.seen[-1] == 15
+    assert watch.seen[-1] == 9
     assert watch.seen == sorted(watch.seen)
     for i in range(3):
         assert (tmp_path / "one" / f"{i}.h5").read_bytes() == (tmp_path / "two" / f"{i}.h5").read_bytes()
@@ -146,7 +146,7 @@ def test_processes_change_nothing(tmp_path, make_shard):
 
 def test_several_objects_give_the_least(make_shard):
     """A row is as good as its worst object; absent objects and other shards' padding do not count."""
-    shard = make_shard(40, objects=3, columns=2, contacts=6)
+    shard = make_shard(20, objects=3, columns=2, contacts=6)
     frames = [mass_frame(record) for record in shard.objects]
     got = row_metrics(shard.grasps, frames, 0.5)
     alone = []
@@ -171,19 +171,19 @@ def test_mass_frame(make_shard):
 
 def test_resume(tmp_path, make_shard):
     for i in range(3):
-        write_shard(tmp_path / "in" / "sub" / f"{i}.h5", make_shard(4, shard_index=i))
+        write_shard(tmp_path / "in" / "sub" / f"{i}.h5", make_shard(2, shard_index=i))
     out = tmp_path / "in" / "out"  # inside the folder, and yet no input of its own
-    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1).made == 12
+    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1).made == 6
     times = {path: path.stat().st_mtime_ns for path in out.rglob("*.h5")}
     assert [path.relative_to(out).as_posix() for path in sorted(times)] == ["sub/0.h5", "sub/1.h5", "sub/2.h5"]
     whole = (out / "sub" / "1.h5").read_bytes()
     (out / "sub" / "1.h5").write_bytes(whole[:-50])
     (out / "sub" / "2.h5").unlink()
-    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1).made == 8
+    assert add_metrics(tmp_path / "in", out, ["volume"], workers=1).made == 4
     assert (out / "sub" / "1.h5").read_bytes() == whole
     assert (out / "sub" / "0.h5").stat().st_mtime_ns == times[out / "sub" / "0.h5"]
-    assert add_metrics(tmp_path / "in", out, BOTH, workers=1).made == 12  # one more metric
-    write_shard(tmp_path / "in" / "sub" / "0.h5", make_shard(4, seed=9))
+    assert add_metrics(tmp_path / "in", out, BOTH, workers=1).made == 6  # one more metric
+    write_shard(tmp_path / "in" / "sub" / "0.h5", make_shard(2, seed=9))
     with pytest.raises(OutputError, match=r"0\.h5 holds other rows than .*choose another --out"):
         add_metrics(tmp_path / "in", out, BOTH, workers=1)
 

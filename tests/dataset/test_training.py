@@ -18,7 +18,7 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 
-SIZES = (4200, 40, 300, 0, 200, 60)
+SIZES = (420, 40, 60, 0, 30, 20)
 ROWS = sum(SIZES)
 
 
@@ -40,7 +40,7 @@ def numbers(rows) -> list[int]:
     return torch.cat([row["candidate"].reshape(-1) for row in rows]).tolist()
 
 
-@pytest.mark.parametrize("buffer", [0, 100, 100_000])
+@pytest.mark.parametrize("buffer", [0, 100])
 def test_every_row_once_an_epoch(folder, buffer):
     data = GraspIterableDataset(folder, columns=["candidate", "q"], buffer=buffer, seed=3)
     found = numbers(data)

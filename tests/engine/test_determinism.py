@@ -38,9 +38,8 @@ def reference(pipeline, source, rows):
     return grasp_arrays(make_shard(pipeline, source, 0, rows, Execution(1, 512)).grasps)
 
 
-@pytest.mark.parametrize(("workers", "batch"), [(1, 64), (3, 200)])
-def test_batch_size_and_workers(pipeline, source, reference, rows, workers, batch):
-    assert_same(reference, grasp_arrays(make_shard(pipeline, source, 0, rows, Execution(workers, batch)).grasps))
+def test_batch_size_and_workers(pipeline, source, reference, rows):
+    assert_same(reference, grasp_arrays(make_shard(pipeline, source, 0, rows, Execution(3, 200)).grasps))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +47,7 @@ def sixty(swift, inputs):
     return make_shard(swift, inputs, 0, 60, Execution(1, 512)).grasps
 
 
-@pytest.mark.parametrize("rate", [3e-2, 1.0, 1e6])
+@pytest.mark.parametrize("rate", [3e-2, 1e6])
 def test_expected_rows_per_candidate(swift, inputs, sixty, monkeypatch, rate):
     """Batches sized by the yield, as on a GPU."""
     expected = grasp_arrays(sixty)
@@ -73,8 +72,8 @@ def test_batches_on_a_gpu_are_enough_and_not_more():
 
 
 def test_rows_do_not_depend_on_the_rate(run, job, grasps, tmp_path):
-    known = run(rows=40, rate=0.03, out=tmp_path / "known")
-    unknown = run(rows=40, out=tmp_path / "unknown")
+    known = run(rows=20, rate=0.03, out=tmp_path / "known")
+    unknown = run(rows=20, out=tmp_path / "unknown")
     assert (
         known.job.measured_rate
         == unknown.job.measured_rate
@@ -95,8 +94,9 @@ def test_cut_of_the_stream(pipeline, source):
             assert value == sum(p.counts[stage][name] for p in parts), (stage, name)
 
 
-def test_fewer_rows_are_among_more(pipeline, source, reference):
-    few = grasp_arrays(make_shard(pipeline, source, 0, 3, Execution(1, 300)).grasps)
+def test_fewer_rows_are_among_more(swift, inputs, sixty):
+    reference = grasp_arrays(sixty)
+    few = grasp_arrays(make_shard(swift, inputs, 0, 3, Execution(1, 300)).grasps)
     place = [np.flatnonzero((reference["q"] == q).all(1))[0] for q in few["q"]]
     assert_same(few, {name: values[place] for name, values in reference.items()})
 
@@ -105,14 +105,6 @@ def test_rows_are_shuffled_and_drawn_from_all_of_a_block(swift, inputs):
     few, many = (make_shard(swift, inputs, 0, rows, Execution()).grasps for rows in (7, 150))
     assert (np.diff(many.index) == 0).mean() < 0.1  # in the order of the stream: 0.5
     assert np.ptp(few.index) > 100  # the first seven of the stream are of candidates 2 to 34
-
-
-@pytest.mark.parametrize("batch", [64, 700])
-def test_several_passes(swift, inputs, batch):
-    """Later passes take the best poses of a batch first, so the engine fixes the batch."""
-    pipeline = swift.with_params("search", passes=2)
-    first = make_shard(pipeline, inputs, 0, 40, Execution(1, 512)).grasps
-    assert_same(grasp_arrays(first), grasp_arrays(make_shard(pipeline, inputs, 0, 40, Execution(2, batch)).grasps))
 
 
 def test_seeds_and_shards_differ(swift, inputs, sixty):

@@ -15,8 +15,8 @@ from lgrasp.grasp.tables import grasp_arrays
 def test_rows_and_counts_are_the_same(swift, inputs):
     graphs = GraphCache(swift)
     for shard in (0, 1):
-        plain = make_shard(swift, inputs, shard, 80, Execution(1, 128))
-        replayed = make_shard(swift, inputs, shard, 80, Execution(1, 128, graphs=graphs))
+        plain = make_shard(swift, inputs, shard, 40, Execution(1, 128))
+        replayed = make_shard(swift, inputs, shard, 40, Execution(1, 128, graphs=graphs))
         assert replayed.counts == plain.counts
         expected, given = grasp_arrays(plain.grasps), grasp_arrays(replayed.grasps)
         for name, values in expected.items():
@@ -27,11 +27,11 @@ def test_shards_side_by_side_take_turns(swift, inputs):
     graphs = GraphCache(swift)
 
     def shard(number, graphs=None):
-        made = make_shard(swift, inputs, number, 40, Execution(1, 64, graphs=graphs))
+        made = make_shard(swift, inputs, number, 20, Execution(1, 64, graphs=graphs))
         return made.counts, grasp_arrays(made.grasps)
 
     with ThreadPoolExecutor(4) as pool:
-        side_by_side = list(pool.map(partial(shard, graphs=graphs), range(5)))
+        side_by_side = list(pool.map(partial(shard, graphs=graphs), range(4)))
     for number, (counts, rows) in enumerate(side_by_side):
         expected, plain = shard(number)
         assert counts == expected

@@ -26,10 +26,10 @@ wp.set_module_options(KERNEL_OPTIONS)
 PARAMS = FieldParams(records=12_000, cell=0.01)
 
 
-@pytest.fixture(scope="module", params=["shipped", "leap"])
-def model(request) -> HandModel:
+@pytest.fixture(scope="module")
+def model() -> HandModel:
     start()
-    return hand_model(request.param)
+    return hand_model("shipped")
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_points_belong_to_the_group(model, field):
 
 def test_reference_kinematics_agrees(model, field):
     """A few records through nothing but the URDF: no shared code."""
-    path, _ = hand_source("shipped" if model.name == "allegro" else model.name)
+    path, _ = hand_source("shipped")
     q, (p, _) = seeds(model, field), realised(model, field)
     for i in np.linspace(0, field.vectors - 1, 12).astype(int):
         poses = link_poses(path, dict(zip(model.tree.joint_names, q[i], strict=True)), model.tree.base_link)
@@ -292,15 +292,6 @@ def test_memory_bound_is_kept(model):
     assert roomy.megabytes <= 512
 
 
-def test_many_records_respect_the_bound():
-    start()
-    model = hand_model("shipped")
-    field = build_field(upload_hand(model, "cpu"), FieldParams(records=400_000, cell=0.02, max_mb=16))
-    assert field.megabytes <= 16
-    assert field.vectors > 100_000
-    assert field.cell < 0.05
-
-
 def test_arrays_round_trip(field):
     arrays = field.to_arrays()
     back = ContactField.from_arrays({k: np.asarray(v) for k, v in arrays.items()})
@@ -319,13 +310,12 @@ def test_same_seed_same_field(model, field):
     assert (other.point != field.point).any()
 
 
-@pytest.mark.parametrize("name", ["index-palm", "thumb-palm", "index-middle", "thumb-index"])
+@pytest.mark.parametrize("name", ["thumb-palm", "thumb-index"])
 def test_field_of_an_opposition_space(name):
     """Vectors of its fingers only, and pairs of its two sides, whose normals point towards each other."""
     start()
-    urdf, spec = hand_source("shipped")
     whole = hand_model("shipped")
-    view = spaces_view(urdf, spec, whole, [name])
+    view = spaces_view(*hand_source("shipped"), whole, [name])
     field = build_field(upload_hand(view, "cpu"), PARAMS)
     fingers = set(np.flatnonzero(np.diff(view.contact_first)[:-1]))
     assert set(groups_of(field)) == fingers

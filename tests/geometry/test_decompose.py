@@ -39,7 +39,8 @@ def test_notch_stays_empty_and_the_surface_covered(outline, notch):
     assert sum(ConvexHull(v).volume for v in pieces) < 1.05 * mesh.volume
 
 
-def test_open_mesh_is_closed_first():
+def test_open_mesh_is_closed_first(monkeypatch):
+    monkeypatch.setitem(module._TREE_SEARCH, "mcts_iterations", 5)
     mesh = prism(ELL)
     pieces = decompose(mesh.vertices, mesh.faces[1:], threshold=6e-3)
     assert len(pieces) >= 2

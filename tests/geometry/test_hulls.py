@@ -27,11 +27,11 @@ def wedge() -> np.ndarray:
 
 
 @pytest.mark.parametrize("make", [ball, rod, wedge])
-@pytest.mark.parametrize("most", [5.0e-5, 2.0e-4, 1.0e-3])
+@pytest.mark.parametrize("most", [2.0e-4, 1.0e-3])
 def test_no_corner_is_left_out_by_more_than_it_says(make, most: float):
     corners = trimesh.convex.convex_hull(make()).vertices
     kept = fewer_corners(corners, most)
-    assert len(kept) < len(corners) or most < 1.0e-4
+    assert len(kept) < len(corners)
     left_out = np.delete(corners, kept, axis=0)
     rng = np.random.default_rng(0)
     for corner in rng.permutation(left_out)[:40]:

@@ -72,7 +72,7 @@ def rechecked(context: Context, table, bounds: GraspBounds):
     return check_grasps(context.hand, context.object, table.pose, table.q, contacts, bounds)
 
 
-@pytest.mark.parametrize("hand", ["barrett", "leap"], indirect=True, scope="module")
+@pytest.mark.parametrize("hand", ["barrett"], indirect=True, scope="module")
 def test_slices_of_bodies_give_the_same_rows(hand, robust, monkeypatch):
     """A GPU looks at the points of a body in several slices."""
     context, whole = robust

@@ -210,7 +210,7 @@ def solved(hand: HandArrays, p: Problem) -> tuple[np.ndarray, np.ndarray]:
     return z, scratch.contacts.numpy()["force"][0, : len(contacts)]
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_without_friction_a_step_has_the_least_energy(hand, seed):
     p = problem(hand, seed, friction=0.0, torsion=0.0)
     found, force = solved(hand, p)
@@ -220,12 +220,11 @@ def test_without_friction_a_step_has_the_least_energy(hand, seed):
     np.testing.assert_allclose(force, p.shared(reference), atol=0.01)
 
 
-@pytest.mark.parametrize("torsion", [0.0, 0.002])
-def test_with_friction_a_step_has_the_least_energy_at_its_own_forces(hand, torsion):
+def test_with_friction_a_step_has_the_least_energy_at_its_own_forces(hand):
     """Nearly: where the object slips, forces and motion are a little behind each other after the last iteration."""
     excess, error = [], []
-    for seed in range(5):
-        p = problem(hand, seed, friction=0.5, torsion=torsion)
+    for seed in range(4):
+        p = problem(hand, seed, friction=0.5, torsion=0.002)
         found, force = solved(hand, p)
         assert (force > 0).sum() >= 2
         np.testing.assert_allclose(force, p.shared(found), atol=1e-3)

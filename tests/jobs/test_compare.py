@@ -24,7 +24,7 @@ def tasks(cache_root, tmp_path_factory):
     """The reports of two tasks, one after the other, which share a hand and a variant on one object; the folder."""
     out = tmp_path_factory.mktemp("compare")
     given = {
-        "hands": ("allegro",),
+        "hands": ("barrett",),
         "objects": ("sphere",),
         "vary": ("link_scale:1.1",),
         "rows": ROWS,
@@ -45,8 +45,8 @@ def test_numbers_are_those_of_the_shards(compared):
     data, out = compared
     assert json.loads(json.dumps(data)) == data
     assert [(hand["hand"], hand["of"], hand["variation"]) for hand in data["hands"]] == [
-        ("allegro", "allegro", None),
-        ("allegro-link_scale-1.1", "allegro", "link_scale-1.1"),
+        ("barrett", "barrett", None),
+        ("barrett-link_scale-1.1", "barrett", "link_scale-1.1"),
     ]
     for hand in data["hands"]:
         (path,) = (out / f"{hand['hand']}-sphere").rglob("*.h5")
@@ -72,7 +72,7 @@ def test_page_stands_alone(compared):
     assert data["page"] == str(out / "compare.html")
     text = (out / "compare.html").read_text(encoding="utf-8")
     assert text.count("data:image/jpeg;base64,") == 2
-    assert "allegro-link_scale-1.1" in text
+    assert "barrett-link_scale-1.1" in text
     assert "<script" not in text
     assert not re.search(r'(src|href)="(?!data:)', text)
 
@@ -80,8 +80,8 @@ def test_page_stands_alone(compared):
 def test_a_task_reports_what_is_there(tasks):
     (first, second), _ = tasks
     assert [(data["missing"], [hand["hand"] for hand in data["hands"]]) for data in (first, second)] == [
-        (1, ["allegro"]),
-        (0, ["allegro", "allegro-link_scale-1.1"]),
+        (1, ["barrett"]),
+        (0, ["barrett", "barrett-link_scale-1.1"]),
     ]
 
 

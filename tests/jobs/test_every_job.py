@@ -11,7 +11,6 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from support.places import QUICK
 from support.sequences import OBJECTS, small_pipeline
 from support.urdfs import arm
 
@@ -21,7 +20,6 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import Job, run
-from lgrasp.jobs.compare.job import CompareJob
 from lgrasp.jobs.export import ExportJob
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.learn.job import FitJob, load_predictor
@@ -50,7 +48,6 @@ NAMES = (
     "learn",
     "metrics",
     "export",
-    "compare",
 )
 
 
@@ -101,11 +98,9 @@ def jobs(swift, source: Path, shards, cache_root: Path) -> Callable[[str, Path],
             params = LearnParams.model_validate(small | {"unrolled": 1})
             return FitJob(**made | {"shards": (shards(18, 18),), "out": out / "coarse.pt"}, params=params)
         if name == "plan":
-            return PlanJob(**base, object="sphere", starts=2, params=PlanParams(rolls=8, finalists=2))
+            return PlanJob(**base, hand="barrett", object="sphere", starts=2, params=PlanParams(rolls=8, finalists=2))
         if name == "export":
             return ExportJob(**made, to="dexgraspnet")
-        if name == "compare":
-            return CompareJob(**base, hands=("allegro",), objects=("sphere", "tiny"), rows=2, pipeline=QUICK)
         if name == "refine":
             return RefineJob(**made, params=RefineParams(matching_rounds=1))
         return MetricsJob(**made, add=("volume",))
@@ -185,7 +180,7 @@ def test_tasks_resume_and_stop(jobs, whole, tmp_path: Path, name: str):
     assert {"asked", "made", "present", "out", "shards", "device", "seconds", "starved", "cancelled"} <= set(data)
 
 
-@pytest.mark.parametrize("name", ["generate", "refine", "simulate", "metrics"])
+@pytest.mark.parametrize("name", ["simulate", "metrics"])
 def test_a_lost_part_is_made_again(jobs, whole, tmp_path: Path, name: str):
     folder = whole(name)[0].job.folder
     lost, *others = sorted(shutil.copytree(folder, tmp_path / "out").rglob("*.h5"))

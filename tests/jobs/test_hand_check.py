@@ -12,6 +12,7 @@ from support.urdfs import gripper
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.field.params import FieldParams
 from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.hand_check.check import check_hand, check_objects
@@ -66,8 +67,9 @@ def share_of_colours(picture: Path) -> tuple[float, ...]:
 
 
 def load_hand(hand: str, swift: Pipeline, cache_root: Path) -> Inputs:
-    keys = input_keys(find_hand(hand), "tiny", 1.0, swift.object, swift.field)
-    return load_inputs(Cache(cache_root), keys, 1.0, swift.object, swift.field, resolve_device("cpu"))
+    field = FieldParams(records=5000)
+    keys = input_keys(find_hand(hand), "tiny", 1.0, swift.object, field)
+    return load_inputs(Cache(cache_root), keys, 1.0, swift.object, field, resolve_device("cpu"))
 
 
 def load_findings(hand: str, swift: Pipeline, cache_root: Path) -> dict[str, list[str]]:

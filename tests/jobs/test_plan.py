@@ -1,4 +1,4 @@
-"""Plans as shards: judged by an independent oracle, the same every time, with the cloud that they were made on."""
+"""Plans as shards: judged by an independent oracle, with the cloud that they were made on."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,7 +27,7 @@ from lgrasp.planning.params import PlanParams
 
 PENETRATION, GAP, CLOUD_GAP, ANGLE = 2.0, 4.0, 6.0, 45.0  # [mm, deg] that docs/guides/refine.md promises
 ROUNDING = 0.1  # [mm] of distance grids; the judge measures meshes
-RADIUS, STARTS, SOME = 0.035, 8, 3
+RADIUS, STARTS = 0.035, 8
 
 
 @pytest.fixture(scope="module")
@@ -108,26 +108,6 @@ def test_rows_say_where_they_come_from(mug):
     assert counts.pop("plan_starts") == sum(counts.values()) == STARTS
     assert counts["plan_kept"] == rows
     assert PlanParams.model_validate(shard.header.config["plan"]) == PlanParams()
-
-
-@pytest.fixture(scope="module")
-def some(plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A shard of the first of these plans."""
-    return plan(tmp_path_factory.mktemp("some"), object="mug", starts=SOME).paths[0]
-
-
-def test_the_same_job_gives_the_same_bytes(some, plan, tmp_path, raw_grasps):
-    again = plan(tmp_path, object="mug", starts=SOME).paths[0]
-    assert raw_grasps(again.parent) == raw_grasps(some.parent)
-
-
-def test_a_start_does_not_depend_on_the_others(mug, some):
-    many, few = (read_shard(path).grasps for path in (mug, some))
-    first = many.candidate < SOME
-    assert first.any()
-    np.testing.assert_array_equal(few.candidate, many.candidate[first])
-    np.testing.assert_array_equal(few.q, many.q[first])
-    np.testing.assert_array_equal(few.object_pose, many.object_pose[first])
 
 
 def test_the_cloud_is_stored_with_its_normals(ball):

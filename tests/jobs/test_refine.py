@@ -216,11 +216,6 @@ def test_regions_are_not_claimed_of_refined_rows(source, refine, tmp_path):
     assert (object_.regions, object_.touch_share) == (None, 1.0)
 
 
-def test_the_same_job_gives_the_same_bytes(source, done, refine, tmp_path, raw_grasps):
-    again = refine(source, tmp_path)
-    assert raw_grasps(again.parent) == raw_grasps(done.parent)
-
-
 def test_a_row_does_not_depend_on_the_others(source, done, refine, tmp_path):
     shard = read_shard(source)
     some = np.array([7, 4, 21, 12])
@@ -273,11 +268,10 @@ def test_a_shard_of_which_no_row_passes_is_empty_and_stays(job, cache_root, tmp_
     job_report(simulated)
 
 
-@pytest.mark.parametrize(("name", "share"), [("sphere", 0.85), ("mug", 0.7)])
-def test_grasps_shaken_by_millimetres_are_recovered(job, refine, tmp_path, name, share):
+def test_grasps_shaken_by_millimetres_are_recovered(job, refine, tmp_path):
     """The object off by 4 mm an axis: most are valid again, and no invalid row is written."""
     rows = 20
-    made = generate(job(object=name, rows=rows, shard_rows=rows, out=tmp_path / "made"))
+    made = generate(job(object="sphere", rows=rows, shard_rows=rows, out=tmp_path / "made"))
     shard = read_shard(made.paths[0])
     pose = shard.grasps.object_pose.copy()
     pose[:, 0, :3] += 0.004 * np.random.default_rng(0).normal(size=(len(pose), 3))
@@ -285,5 +279,5 @@ def test_grasps_shaken_by_millimetres_are_recovered(job, refine, tmp_path, name,
     done = refine(tmp_path / "shaken.h5", tmp_path / "out")
     report = judge(done)
     assert report.valid.all(), report
-    assert len(report.valid) >= share * rows
+    assert len(report.valid) >= 0.85 * rows
     assert numbers(done)[0][0] < 0.1 * rows

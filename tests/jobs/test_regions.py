@@ -75,9 +75,8 @@ def test_a_handle_is_found(steered):
     passes(path)
 
 
-@pytest.mark.parametrize("table", [False, True], ids=["in the air", "on a table"])
-def test_share_of_the_force(steered, swift, table):
-    shard, path = steered(swift.with_table() if table else swift, touch=f"{TOP}:0.6")
+def test_share_of_the_force(steered, swift):
+    shard, path = steered(swift.with_table(), touch=f"{TOP}:0.6")
     row, points, push = contacts(shard)
     on = points[:, 2] >= 0.06
     share = np.bincount(row, push * on) / np.bincount(row, push)

@@ -60,11 +60,9 @@ def rows_of(grasps):
     return list(zip(grasps.index.tolist(), grasps.slot.tolist(), strict=True))
 
 
-@pytest.mark.parametrize("name", ["swift", "lightning"])
-def test_going_on_gives_the_rows_of_a_run_without_a_break(name, request, load, cache, calls):
-    pipeline = request.getfixturevalue(name).with_params("search", passes=3)
-    source = load(pipeline=pipeline)
-    few, many = (40, 200) if name == "swift" else (3, 8)
+def test_going_on_gives_the_rows_of_a_run_without_a_break(swift, inputs, cache, calls):
+    pipeline = swift.with_params("search", passes=3)
+    source, few, many = inputs, 40, 200
     whole = make_shard(pipeline, source, 0, many, Execution(1, 256))
     begun = make_shard(pipeline, source, 0, few, Execution(1, 256), bank_cache=cache)
     before = dict(calls)
@@ -156,7 +154,7 @@ def plain(several, inputs):
     return make_shard(several, inputs, 0, 100, Execution(1)).grasps
 
 
-@pytest.mark.parametrize(("workers", "batch"), [(1, 1), (2, 100), (2, 512)])
+@pytest.mark.parametrize(("workers", "batch"), [(1, 1), (2, 100)])
 def test_passes_do_not_depend_on_the_batches(several, inputs, plain, workers, batch):
     assert_same(plain, make_shard(several, inputs, 0, 100, Execution(workers, batch)).grasps)
 
@@ -173,10 +171,9 @@ def test_how_many_passes(swift, several):
         swift.with_passes(65)
 
 
-@pytest.mark.parametrize("passes", [1, PASSES])
-def test_a_folder_that_grows(run, swift, grasps, calls, tmp_path, passes):
+def test_a_folder_that_grows(run, several, grasps, calls, tmp_path):
     """Twice with more rows asked, and once: the same file; rows that were there stay, and are not made again."""
-    common = {"pipeline": swift.with_passes(passes), "shard_rows": 10_000, "batch": 256}
+    common = {"pipeline": several, "shard_rows": 10_000, "batch": 256}
     run(rows=50, out=tmp_path / "a", **common)
     few = grasps(tmp_path / "a")["q"]
     before = calls["place"]

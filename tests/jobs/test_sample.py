@@ -105,7 +105,7 @@ def test_training_learns_and_the_seed_decides(network, shards, cache, tmp_path):
     assert about.report["loss"] < 0.95  # 1 of a network that knows nothing
     assert about.report["objects"] == ["mug", "sphere"]
     assert about.space_names[0] == "index-palm"
-    params, weights = DiffuserParams.model_validate(TINY | {"steps": 15}), []
+    params, weights = DiffuserParams.model_validate(TINY | {"steps": 5}), []
     for out in (tmp_path / "once.pt", tmp_path / "again.pt"):
         run(DiffuserJob(shards=(shards,), out=out, params=params, device="cpu", cache=cache))
         weights.append(load_diffuser(out)[0].state_dict())
@@ -197,7 +197,7 @@ def clouds(inputs, tmp_path):
     found = []
     for obj, name, shift in zip(inputs.objects, OBJECTS, (0.0, 0.2), strict=True):
         normals, _ = face_normals(obj.model.vertices, obj.model.faces)
-        points, face = sample_surface(obj.model.vertices, obj.model.faces, 3000, seed=0)
+        points, face = sample_surface(obj.model.vertices, obj.model.faces, 1500, seed=0)
         found.append(tmp_path / f"{name}.npz")
         np.savez(found[-1], points=points + shift, normals=normals[face])
     return tuple(found)

@@ -49,17 +49,14 @@ def test_rows_and_report_are_those_of_one_at_a_time(plain, side_by_side, run, gr
     assert not multiprocessing.active_children()
 
 
-def test_stopped_it_leaves_whole_shards_and_goes_on(plain, side_by_side, job, grasps, tmp_path):
+def test_stopped_it_leaves_whole_shards(plain, side_by_side, job, raw_grasps, tmp_path):
     outcome = run_job(job(rows=ROWS), StopAfter(2))
     assert outcome.cancelled
     assert not multiprocessing.active_children()
     paths = sorted((tmp_path / "out").glob("*.h5"))
     assert 0 < len(paths) < 6
     assert [validate_shard(path) for path in paths] == [[]] * len(paths)
-    run_job(job(rows=ROWS))
-    expected = grasps(plain.job.out)
-    for name, values in grasps(tmp_path / "out").items():
-        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+    assert raw_grasps(tmp_path / "out").items() <= raw_grasps(plain.job.out).items()
 
 
 def test_a_writer_that_is_lost_ends_the_job_with_a_line(side_by_side, run, tmp_path, monkeypatch):

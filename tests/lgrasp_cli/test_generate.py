@@ -115,11 +115,6 @@ def test_rows_of_higher_friction_are_not_strict(generate):
     assert json.loads(generate("--set", "bounds.friction=0.8", "--json", "-").out)["strict"] == 0
 
 
-def test_quiet(generate):
-    result = generate("--quiet")
-    assert (result.code, result.out, result.err) == (0, "", "")
-
-
 def test_resume_counts_what_is_there(generate, tmp_path):
     generate("--shard-rows", 8)
     (tmp_path / "out" / "allegro-tiny-00001.h5").unlink()
@@ -146,9 +141,9 @@ def test_more_rows_later(cli, generate, tmp_path):
 
 
 def test_force_makes_everything_anew(generate):
-    generate()
-    data = json.loads(generate("--json", "-", "--force").out)
-    assert data["made"] == 20
+    generate(rows=2)
+    data = json.loads(generate("--json", "-", "--force", rows=2).out)
+    assert data["made"] == 2
     assert data["hits"] == {"hand": False, "object": False, "field": False}
 
 
@@ -247,7 +242,7 @@ def test_starved_run_keeps_what_it_found(generate, tmp_path, monkeypatch):
 def test_interruption_leaves_whole_shards(process, generate, tmp_path, quick):
     generate(rows=1)  # inputs are cached
     out = tmp_path / "many"
-    base = ("--object", "tiny", "--pipeline", quick, "--device", "cpu", "--shard-rows", 20, "--batch", 128)
+    base = ("--object", "tiny", "--pipeline", quick, "--device", "cpu", "--shard-rows", 8, "--batch", 128)
     running = process("generate", *base, "-n", 10_000, "--out", out)
     until = time.monotonic() + 30
     while not list(out.glob("*.h5")) and time.monotonic() < until:
@@ -260,10 +255,10 @@ def test_interruption_leaves_whole_shards(process, generate, tmp_path, quick):
     shards = sorted(out.glob("*.h5"))
     assert shards
     assert sorted(out.iterdir()) == [*shards, out / "manifest.json"]
-    assert {len(read_shard(p).grasps) for p in shards} == {20}
+    assert {len(read_shard(p).grasps) for p in shards} == {8}
     kept = {p: p.stat().st_mtime_ns for p in shards}
     for folder in (out, tmp_path / "whole"):
-        assert generate("--shard-rows", 20, rows=60, out=folder).code == 0
+        assert generate("--shard-rows", 8, rows=24, out=folder).code == 0
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
     for path in sorted((tmp_path / "whole").glob("*.h5")):
         whole, resumed = read_shard(path).grasps.columns(), read_shard(out / path.name).grasps.columns()
@@ -278,7 +273,7 @@ def catches(process: subprocess.Popen[str], number: int) -> bool:
     return bool(int(status.partition("SigCgt:")[2].split()[0], 16) >> (number - 1) & 1)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("delay", [0.0, 1.0])
 def test_interruption_while_loading(process, tmp_path, delay):
     running = process("generate", "--object", "mug", "-n", 1_000_000, "--out", tmp_path / "out")
     while not catches(running, signal.SIGTERM):
@@ -323,7 +318,8 @@ def test_debug_leaves_errors_to_python(cli, monkeypatch):
 def test_the_first_kernels_of_a_machine_are_announced(generate, monkeypatch, tmp_path):
     monkeypatch.setattr("lgrasp.runtime.kernels.has_compiled", lambda folder, cuda: False)
     assert "compiling kernels once for this machine" in generate(rows=1).err.splitlines()[0]
-    assert generate("--quiet", rows=1, out=tmp_path / "quiet").err == ""
+    quiet = generate("--quiet", rows=1, out=tmp_path / "quiet")
+    assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
 
 
 def test_physics_is_the_old_name_of_simulate(generate):

@@ -69,7 +69,7 @@ def test_check_measures_the_spaces(cli, jaws, quick, tmp_path):
     thin = [part | {"box": {"min": [5, 5, 5], "max": [6, 6, 6]}} for part in rules[PINCH]["sides"]]
     change(jaws, rules | {"away": rules[PINCH] | {"sides": away}, "nothing": rules[PINCH] | {"sides": thin}})
     folder = tmp_path / "pictures"
-    shown = cli("hands", "check", jaws, "-n", 5, "-p", quick, "--device", "cpu", "--out", folder, "--quiet")
+    shown = cli("hands", "check", jaws, "-n", 1, "-p", quick, "--device", "cpu", "--out", folder, "--quiet")
     assert shown.code == 0, shown
     lines = shown.out.splitlines()
     table = next(i for i, line in enumerate(lines) if line.startswith("space "))
@@ -103,19 +103,19 @@ def test_spaces_that_do_not_fit_are_refused(cli, jaws):
 
 
 def test_compare_prints_a_line_for_each_hand(cli, jaws, quick, tmp_path):
-    given = ("hands", "compare", jaws, "--object", "sphere", "-n", 3, "-p", quick, "--out", tmp_path / "out")
+    given = ("hands", "compare", jaws, "--object", "sphere", "-n", 1, "-p", quick, "--out", tmp_path / "out")
     found = cli(*given, "--vary", "link_scale:1.1", "--json", tmp_path / "found.json")
     lines = found.out.splitlines()
     assert [line.split()[:2] for line in lines[:3]] == [
         ["hand", "rows"],
-        ["jaws", "3"],
-        ["jaws-link_scale-1.1", "3"],
+        ["jaws", "1"],
+        ["jaws-link_scale-1.1", "1"],
     ]
     assert f"page  {tmp_path / 'out' / 'compare.html'}" in found.out
     hands = json.loads((tmp_path / "found.json").read_text())["hands"]
-    assert [hand["all"]["rows"] for hand in hands] == [3, 3]
+    assert [hand["all"]["rows"] for hand in hands] == [1, 1]
     told = cli(*given, "--verbose", "--json", tmp_path / "again.json").out  # without the variant, whose hand is there
     again = json.loads((tmp_path / "again.json").read_text())
-    assert (again["made"], again["present"]) == (0, 3)
-    assert ["sphere", "jaws", "3"] in [line.split()[:3] for line in told.splitlines()]
+    assert (again["made"], again["present"]) == (0, 1)
+    assert ["sphere", "jaws", "1"] in [line.split()[:3] for line in told.splitlines()]
     assert "belongs to another run" in cli(*given, "-n", 4).error()

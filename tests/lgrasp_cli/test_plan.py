@@ -1,8 +1,6 @@
 """``lgrasp plan``."""
 
 import json
-import signal
-import time
 
 import numpy as np
 import pytest
@@ -107,13 +105,3 @@ def test_bad_input(cli, tmp_path, arguments, said):
 def test_bad_viewpoint(cli, cloud):
     assert "give 3 numbers" in cli("plan", "--cloud", cloud, "--viewpoint", "1,2").error()
     assert "'nan,0,0': give 3 numbers" in cli("plan", "--cloud", cloud, "--viewpoint", "nan,0,0").error()
-
-
-def test_interrupted(process, tmp_path):
-    """Ctrl-C ends with 130 and leaves no half file."""
-    out = tmp_path / "out"
-    with process("plan", "--object", "sphere", "--starts", 2000, "--device", "cpu", "--out", out) as run:
-        time.sleep(2)
-        run.send_signal(signal.SIGINT)
-        assert run.wait(20) == 130
-    assert not list(out.glob("*"))

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import signal
-import time
 from dataclasses import replace
 
 import h5py
@@ -19,7 +17,7 @@ from lgrasp.dataset.writer import write_shard
 @pytest.fixture
 def shards(generate, once, tmp_path):
     if not (once / "out").exists():
-        assert generate(out=once / "out").code == 0
+        assert generate(rows=8, out=once / "out").code == 0
     return shutil.copytree(once / "out", tmp_path / "out")
 
 
@@ -247,23 +245,10 @@ def test_plans_of_a_cloud_can_be_refined(cli, tmp_path):
     cloud = ("plan", "--cloud", tmp_path / "ball.npz", "--starts", 2, "--device", "cpu", "-q")
     assert cli(*cloud, "--out", planned).code == 0
     assert (
-        cli("refine", planned, "--out", out, "--keep-invalid", "--matching-rounds", 2, "--device", "cpu", "-q").code
+        cli("refine", planned, "--out", out, "--keep-invalid", "--matching-rounds", 1, "--device", "cpu", "-q").code
         == 0
     )
     before, after = (read_shard(next(folder.glob("*.h5"))) for folder in (planned, out))
     np.testing.assert_array_equal(after.objects[0].normals, before.objects[0].normals)
     assert (after.grasps.metrics["energy"] > 0).all()
     assert "is a point cloud" in cli("simulate", planned, "--out", tmp_path / "x").error()
-
-
-def test_interrupted(process, shards, tmp_path):
-    """Ctrl-C ends with 130 and leaves no half file."""
-    out = tmp_path / "refined"
-    with process(
-        "refine", shards, "--matching-rounds", 1000, "--gradient-steps", 50, "--device", "cpu", "--out", out
-    ) as run:
-        time.sleep(2)
-        run.send_signal(signal.SIGINT)
-        assert run.wait(20) == 130
-        assert run.stderr.read().splitlines()[-1].startswith("interrupted")
-    assert not list(out.glob("*"))

@@ -86,7 +86,7 @@ def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_pat
         "--object",
         "mug",
         "-n",
-        "5",
+        "1",
         "--pipeline",
         "swift",
         "--set",

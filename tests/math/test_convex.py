@@ -105,7 +105,7 @@ def cases():
     """Pairs near contact: distance from the margin is drawn log-uniformly around 0.2 mm, on both sides."""
     rng = np.random.default_rng(0)
     pieces, pairs, poses, exact, margins = [], [], [], [], []
-    for k in range(600):
+    for k in range(250):
         a, b = random_piece(KINDS[k % 5], rng), random_piece(KINDS[rng.integers(5)], rng)
         R = Rotation.random(random_state=k).as_matrix()
         u = rng.normal(size=3)
@@ -114,7 +114,7 @@ def cases():
         away = float(rng.choice([-1, 1]) * 10 ** rng.uniform(-6, -2.3))
         # slide b along u until its distance is margin + away
         low, high, solids = 0.0, 0.2, (coal_solid(a), coal_solid(b))
-        for _ in range(40):
+        for _ in range(24):
             t = 0.5 * (low + high)
             near = coal_distance(a, b, R, t * u, solids) < margin + max(away, 1e-6 - margin)
             low, high = (t, high) if near else (low, t)
@@ -142,8 +142,8 @@ def ask(device, pieces, pairs, poses, margins) -> np.ndarray:
 def test_clear_agrees_with_coal(device, cases):
     pieces, pairs, poses, exact, margins = cases
     clear = ask(device, pieces, pairs, poses, margins)
-    assert (exact < margins).sum() > 120
-    assert (np.abs(exact - margins) < 2e-4).sum() > 200
+    assert (exact < margins).sum() > 50
+    assert (np.abs(exact - margins) < 2e-4).sum() > 80
     false_clear = clear & (exact < margins - 1e-5)
     assert not false_clear.any(), (exact - margins)[false_clear]
     missed = ~clear & (exact > margins + 1e-4)

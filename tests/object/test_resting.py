@@ -34,12 +34,9 @@ def test_box_rests_on_its_faces(fast):
         assert planes[k, 3] == pytest.approx(up @ at - size[axis] / 2, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    "mesh", [trimesh.creation.icosphere(3, 0.03), trimesh.creation.cylinder(0.02, 0.1, sections=128)]
-)
-def test_round_objects_rest_on_few_planes(mesh, fast):
+def test_round_objects_rest_on_few_planes(fast):
     """They stand for all: nowhere is far from one, and the object lies on each with nothing below it."""
-    obj, planes = made(mesh, fast)
+    obj, planes = made(trimesh.creation.cylinder(0.02, 0.1, sections=128), fast)
     assert 6 <= len(planes) <= MOST_PLANES
     assert planes[:, 4].sum() == pytest.approx(1.0, abs=1e-6)
     height = (obj.vertices @ planes[:, :3].T).min(0)

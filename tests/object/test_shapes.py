@@ -11,15 +11,14 @@ from lgrasp.object.shapes import deformed_shape, random_shape
 
 @pytest.mark.parametrize("kind", [None, *get_args(ShapeKind)])
 def test_shapes(kind):
-    for number in range(2):
-        mesh = random_shape(3, number, kind, (0.04, 0.12))
-        assert mesh.is_watertight
-        assert mesh.body_count == 1
-        assert mesh.volume > 0
-        assert 0.04 <= mesh.extents.max() <= 0.12
-        assert np.array_equal(mesh.vertices, random_shape(3, number, kind, (0.04, 0.12)).vertices)
-        assert not np.array_equal(mesh.bounds, random_shape(4, number, kind, (0.04, 0.12)).bounds)
-        assert random_shape(3, number, kind).extents.max() <= 0.2201
+    mesh = random_shape(3, 1, kind, (0.04, 0.12))
+    assert mesh.is_watertight
+    assert mesh.body_count == 1
+    assert mesh.volume > 0
+    assert 0.04 <= mesh.extents.max() <= 0.12
+    assert np.array_equal(mesh.vertices, random_shape(3, 1, kind, (0.04, 0.12)).vertices)
+    assert not np.array_equal(mesh.bounds, random_shape(4, 1, kind, (0.04, 0.12)).bounds)
+    assert random_shape(3, 1, kind).extents.max() <= 0.2201
 
 
 def test_mugs_and_bowls_are_hollow():
@@ -31,7 +30,7 @@ def test_mugs_and_bowls_are_hollow():
 
 
 def test_deformed_solids_are_still_solids():
-    for number, kind in enumerate(["box", "can", "mug", "tool"]):
+    for number, kind in enumerate(["box", "mug"]):
         mesh = random_shape(0, 0, kind)
         deformed = [deformed_shape(mesh, np.random.default_rng(seed)) for seed in (number, number, 9)]
         assert all(one.is_watertight and one.volume > 0 for one in deformed)

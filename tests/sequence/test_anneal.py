@@ -34,7 +34,7 @@ class Levels:
         return self._temperature
 
 
-@pytest.mark.parametrize("fall", [0.5, 0.0, -0.1, -0.7, -2.0, -3.0])
+@pytest.mark.parametrize("fall", [0.5, -0.7, -3.0])
 def test_acceptance_follows_the_exponential_law(fall):
     """Within 1 % of min(1, exp((E_old - E_new) / T)), with the numbers that the rows of a run draw."""
     u = uniforms(torch.arange(1_000_000), 7, 5)[:, 0]

@@ -93,18 +93,18 @@ def test_a_hand_that_closes_above_the_object_lifts_nothing(jaws: Jaws, lift):
     assert found["pushed"] < 1e-3
 
 
-def test_rows_stand_alone(jaws: Jaws, lift):
+def test_rows_stand_alone(jaws: Jaws):
     """Neither the number of threads nor the other rows decide a verdict."""
     shard = standing(jaws, 1.0, count=3)
     depth = np.array([[0.3], [4.0], [2.0]], "f4") / np.float32(SLIDING)
     approach = np.array([[0, 0, 1], [0, 0, 1], [0, 0.6, 0.8]], "f4")
     table = dict(shard.grasps.table) | {"approach": approach}
     rows = replace(shard.grasps, q_squeeze=shard.grasps.q - depth, table=table)
-    one, two = (judge(shard, lift, rows=rows, threads=n) for n in (1, 2))
+    one, two = (judge(shard, LIFT, rows=rows, threads=n) for n in (1, 2))
     assert one["holds"].tolist() == [False, True, True]
     columns = {name: values[-1:] for name, values in rows.columns().items() if "/" not in name}
     last = replace(rows, **columns, table={name: values[-1:] for name, values in table.items()})
-    single = judge(shard, lift, rows=last)
+    single = judge(shard, LIFT, rows=last)
     for name, values in one.items():
         np.testing.assert_array_equal(values, two[name], err_msg=name)
         np.testing.assert_array_equal(values[-1:], single[name], err_msg=name)

@@ -80,16 +80,15 @@ def test_where_gravity_points():
     assert np.linalg.matrix_rank(AXES[0] - course[0][:-hold], tol=1.0) == 3
 
 
-def test_rows_stand_alone_and_their_text_says_all(engine):
+def test_rows_stand_alone_and_their_text_says_all():
     """Neither the number of threads nor the other rows decide a verdict, and all numbers are stored."""
-    protocol = SHAKE.by(engine)
     shard = twin_shard(twin_rows(4 * WEIGHT / SLIDING, count=2))
-    one, two = (judge(shard, protocol, threads=n) for n in (1, 2))
+    one, two = (judge(shard, SHAKE, threads=n) for n in (1, 2))
     for name, values in one.items():
         np.testing.assert_array_equal(values, two[name], err_msg=name)
         np.testing.assert_array_equal(values[:1], values[1:], err_msg=name)
-    text = json.loads(protocol_text(scene_of(shard.hand, shard.objects), protocol))
-    assert Protocol.model_validate({name: text[name] for name in Protocol.model_fields}) == protocol
+    text = json.loads(protocol_text(scene_of(shard.hand, shard.objects), SHAKE))
+    assert Protocol.model_validate({name: text[name] for name in Protocol.model_fields}) == SHAKE
 
 
 def test_what_it_refuses(jaws: Jaws):

@@ -3,13 +3,11 @@
 import os
 import signal
 from multiprocessing.context import ForkServerProcess
-from multiprocessing.synchronize import Event
 from pathlib import Path
 
 from support.forked import fork_server
 
 from lgrasp.engine.cache import Cache
-from lgrasp.engine.events import Events
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.field.params import FieldParams
 from lgrasp.jobs.generate import GenerateJob, generate
@@ -25,19 +23,9 @@ class Child:
     def __init__(
         self, out: Path, cache: Path, rows: int, shard_rows: int = 20, *, task: tuple[int, int] = (0, 1), dies=False
     ) -> None:
-        context = fork_server()
-        self._started = context.Event()
-        self._process: ForkServerProcess = context.Process(
-            target=_generate, args=(out, cache, rows, shard_rows, task, dies, self._started)
-        )
+        args = out, cache, rows, shard_rows, task, dies
+        self._process: ForkServerProcess = fork_server().Process(target=_generate, args=args)
         self._process.start()
-
-    def begun(self) -> bool:
-        """Wait until the job has looked at what is there."""
-        return self._started.wait(120)
-
-    def kill(self) -> None:
-        self._process.kill()
 
     def finish(self) -> int | None:
         """The exit code, negative for a signal."""
@@ -45,15 +33,7 @@ class Child:
         return self._process.exitcode
 
 
-class _Say(Events):
-    def __init__(self, started: Event) -> None:
-        self._started = started
-
-    def started(self, parts, present):
-        self._started.set()
-
-
-def _generate(out: Path, cache: Path, rows: int, shard_rows: int, task: tuple[int, int], dies: bool, started: Event):
+def _generate(out: Path, cache: Path, rows: int, shard_rows: int, task: tuple[int, int], dies: bool):
     if dies:
         replace = os.replace
 
@@ -66,4 +46,4 @@ def _generate(out: Path, cache: Path, rows: int, shard_rows: int, task: tuple[in
     pipeline = load_pipeline("swift").model_copy(update={"field": FieldParams(records=20_000)})
     given = {"hand": "allegro", "object": "mug", "rows": rows, "shard_rows": shard_rows, "device": "cpu", "workers": 1}
     job = GenerateJob(**given, pipeline=pipeline, out=out, cache=Cache(cache))
-    generate(job, _Say(started), array=task)
+    generate(job, array=task)

@@ -228,7 +228,7 @@ def test_a_single_scene_is_not_enough(tmp_path):
         read_mjcf(tmp_path / "a.xml")
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["dexgraspnet", "mjcf"])
 def test_what_was_read_makes_a_shard(tmp_path, shards, form):
     """The way in: rows of another format become a shard that conforms."""
     shard = shards.make(tmp_path / "a.h5", "barrett")

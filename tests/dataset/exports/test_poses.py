@@ -30,7 +30,7 @@ def homogeneous(pose) -> np.ndarray:
     return T
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=60)
 @given(POSES)
 def test_euler_angles_mean_the_rotation(pose):
     quaternion = canonical(pose[3:])
@@ -40,7 +40,7 @@ def test_euler_angles_mean_the_rotation(pose):
     assert abs(angles[1]) <= np.pi / 2 + 1e-12
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=60)
 @given(ANGLES, ANGLES, TINY, st.sampled_from([-1, 1]))
 def test_euler_angles_in_and_near_gimbal_lock(a, c, off, side):
     rotation = Rotation.from_euler("xyz", [a, side * (np.pi / 2 - off), c])
@@ -50,7 +50,7 @@ def test_euler_angles_in_and_near_gimbal_lock(a, c, off, side):
     np.testing.assert_allclose(Rotation.from_euler("xyz", angles).as_matrix(), matrix(quaternion), atol=1e-7)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(ANGLES, ANGLES, ANGLES)
 def test_quaternions_of_euler_angles(a, b, c):
     quaternion = quaternion_from_euler(np.array([a, b, c]))
@@ -58,7 +58,7 @@ def test_quaternions_of_euler_angles(a, b, c):
     assert quaternion[0] >= 0
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(POSES, POSES)
 def test_products_and_inverses(a, b):
     np.testing.assert_allclose(homogeneous(compose(a, b)), homogeneous(a) @ homogeneous(b), atol=1e-9)

@@ -19,7 +19,7 @@ from lgrasp.geometry.poses import pose_matrix
 from lgrasp.object.mass import mass_properties
 
 SINGLE = ["dexgraspnet", "dexgraspbench", "isaac-grasp", "graspgen", "usd", "webdataset"]
-HANDS = ["allegro", "schunk_svh", "barrett", "shadow"]
+HANDS = ["schunk_svh", "shadow"]
 
 
 def matrix(position, rotation: Rotation) -> np.ndarray:
@@ -119,9 +119,9 @@ def assert_same(read, shard, form: str) -> None:
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("hand", HANDS)
 def test_read_back(tmp_path, shards, hand, form):
-    shard = shards.make(tmp_path / "a.h5", hand)
+    shard = shards.make(tmp_path / "a.h5", hand, n=3)
     done = export_shards(tmp_path / "a.h5", tmp_path / "out", form)
-    assert done == (6, ("cup",))
+    assert done == (3, ("cup",))
     read = read_grasps(tmp_path / "out", form)
     assert read.joint_names == tuple(shard.hand.joint_names)
     assert_same(read, shard, form)
@@ -132,13 +132,19 @@ def test_read_back(tmp_path, shards, hand, form):
     turned = tuple(reversed(read.joint_names))
     assert_same(read_grasps(tmp_path / "out", form, joint_names=turned), shard, form)
     assert read_grasps(tmp_path / "out", form, joint_names=turned).joint_names == turned
+    text = (tmp_path / "out" / "README.txt").read_text()
+    words = ["metres, radians", "w first", "hand.urdf", "cup (3)", "a.h5"]
+    assert all(word in text for word in (*words, *shard.hand.joint_names)), text
+    if hand == "shadow":
+        assert ("palm" if form == "isaac-grasp" else "world") in text
+    if form in RAW:
+        check_links(tmp_path, shard, form)
 
 
-@pytest.mark.parametrize("hand", ["allegro", "shadow"])
-def test_points_of_a_stage(tmp_path, shards, hand):
+def test_points_of_a_stage(tmp_path, shards):
     """In each posture and row the points of every link in the world, by OpenUSD, are where yourdfpy has that link; the
     object's are those of the shard."""
-    shard = shards.make(tmp_path / "a.h5", hand, n=3)
+    shard = shards.make(tmp_path / "a.h5", "shadow", n=3)
     export_shards(tmp_path / "a.h5", tmp_path / "out", "usd")
     (tmp_path / "hand.urdf").write_text(shard.hand.urdf)
     urdf = yourdfpy.URDF.load(str(tmp_path / "hand.urdf"), load_meshes=False)
@@ -167,18 +173,14 @@ def test_points_of_a_stage(tmp_path, shards, hand):
                 np.testing.assert_allclose(got, points @ T.T, atol=1e-6)
 
 
-@pytest.mark.parametrize("form", SINGLE)
-@pytest.mark.parametrize("hand", HANDS)
-def test_every_link_is_where_it_was(tmp_path, shards, hand, form):
+def check_links(folder: Path, shard, form: str) -> None:
     """The raw files, posed by yourdfpy with the exported URDF, against the shard's URDF posed by the shard's rows."""
-    shard = shards.make(tmp_path / "a.h5", hand, n=3)
-    export_shards(tmp_path / "a.h5", tmp_path / "out", form)
-    index = json.loads((tmp_path / "out" / "export.json").read_text())["hand"]
-    (tmp_path / "hand.urdf").write_text(shard.hand.urdf)
-    theirs, ours = load(tmp_path / "out" / "hand" / "hand.urdf"), load(tmp_path / "hand.urdf")
+    index = json.loads((folder / "out" / "export.json").read_text())["hand"]
+    (folder / "hand.urdf").write_text(shard.hand.urdf)
+    theirs, ours = load(folder / "out" / "hand" / "hand.urdf"), load(folder / "hand.urdf")
     assert theirs.base_link == index["root_link"]
     for row, (q, pose) in enumerate(zip(shard.grasps.q, shard.grasps.object_pose[:, 0], strict=True)):
-        T_object_hand, link, joints = RAW[form](tmp_path / "out", row)
+        T_object_hand, link, joints = RAW[form](folder / "out", row)
         T_base_object = matrix(pose[:3], Rotation.from_quat(pose[3:], scalar_first=True))
         posed(theirs, joints), posed(ours, dict(zip(shard.hand.joint_names, q, strict=True)))
         for name in shard.hand.link_names:
@@ -239,11 +241,10 @@ def check_scenes(mujoco, folder: Path, shard) -> None:
         assert model.opt.gravity == pytest.approx([0, 0, 0])
 
 
-@pytest.mark.parametrize("hand", ["schunk_svh", "barrett"])
-def test_real_hands_can_be_used_alone(tmp_path, shards, hand):
+def test_a_real_hand_can_be_used_alone(tmp_path, shards):
     """All meshes are in the folder: it is moved, and yourdfpy, trimesh and MuJoCo open it."""
     mujoco = pytest.importorskip("mujoco")
-    shard = shards.make(tmp_path / "a.h5", shards.hand(hand, real=True), n=2)
+    shard = shards.make(tmp_path / "a.h5", shards.hand("barrett", real=True), n=2)
     export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf")
     assert_same(read_grasps(tmp_path / "out", "mjcf"), shard, "mjcf")
     check_scenes(mujoco, tmp_path, shard)
@@ -259,7 +260,7 @@ def test_real_hands_can_be_used_alone(tmp_path, shards, hand):
     )
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", ["dexgraspnet", "webdataset", "mjcf"])
 def test_joints_go_by_name(tmp_path, shards, form):
     """A second shard of the same hand lists its joints in another order."""
     first = shards.make(tmp_path / "a.h5", "schunk_svh", n=2)
@@ -277,13 +278,3 @@ def test_joints_go_by_name(tmp_path, shards, form):
     assert read.joint_names == tuple(hand.joint_names)
     np.testing.assert_allclose(read.grasps.q[2:][:, order], second.grasps.q, atol=1e-6)
     np.testing.assert_allclose(read.grasps.q[:2], first.grasps.q, atol=1e-6)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_readme_says_what_matters(tmp_path, shards, form):
-    shard = shards.make(tmp_path / "a.h5", "shadow")
-    export_shards(tmp_path / "a.h5", tmp_path / "out", form)
-    text = (tmp_path / "out" / "README.txt").read_text()
-    words = ["metres, radians", "w first", "hand.urdf", "cup (6)", "a.h5"]
-    assert all(word in text for word in (*words, *shard.hand.joint_names)), text
-    assert ("palm" if form == "isaac-grasp" else "world") in text

@@ -32,9 +32,7 @@ def test_conditions_and_limit(tmp_path, shards):
     q, seen = np.concatenate([first.q, second.q]), []
     for number, (options, rows) in enumerate(
         [
-            ({}, range(12)),
             ({"limit": 8}, range(8)),
-            ({"where": ["physics/fc_holds"]}, [0, 2, 3, 5, 6, 8, 9, 11]),
             ({"where": ["physics/fc_holds"], "limit": 5}, [0, 2, 3, 5, 6]),
             ({"where": ["physics/fc_holds", "metrics/epsilon>=0.5"]}, [3, 5, 9, 11]),
         ]
@@ -42,7 +40,7 @@ def test_conditions_and_limit(tmp_path, shards):
         got = exported(tmp_path, tmp_path / f"out{number}", advance=lambda *done: seen.append(done), **options)
         np.testing.assert_array_equal(got.q, q[list(rows)])
         assert seen[-1] == (len(rows), len(rows))
-    index = json.loads((tmp_path / "out4" / "export.json").read_text())
+    index = json.loads((tmp_path / "out2" / "export.json").read_text())
     assert (index["rows"], index["where"]) == (4, ["physics/fc_holds", "metrics/epsilon >= 0.5"])
 
 
@@ -128,8 +126,7 @@ def test_several_objects_are_refused(tmp_path, shards, form):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("form", SINGLE)
-@pytest.mark.parametrize("where", ["candidate > 0", "objects == 1"])
+@pytest.mark.parametrize(("form", "where"), [("dexgraspnet", "candidate > 0"), ("usd", "objects == 1")])
 def test_rows_of_one_object_each_beside_others(tmp_path, shards, form, where):
     """The shard has room for two objects in a row; the chosen rows hold one each."""
     shard = several(shards, tmp_path / "a.h5").grasps
@@ -221,7 +218,7 @@ def test_a_hand_that_cannot_be_used_is_named(tmp_path, shards):
         ),
     ]:
         shards.make(tmp_path / "a.h5", replace(hand, urdf=urdf + "<robot" * (urdf == "<robot")), n=1)
-        for form in FORMATS:
+        for form in ("dexgraspnet", "mjcf"):
             with pytest.raises(LgraspError, match=words):
                 export_shards(tmp_path / "a.h5", tmp_path / "out", form)
             assert not (tmp_path / "out").exists()

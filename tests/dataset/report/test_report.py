@@ -127,7 +127,7 @@ def test_generated_grasps(run, make, tmp_path, grasps):
     assert "<h3>Physics</h3>" not in text
 
 
-def test_rows_are_counted_by_the_grasp_type_asked(make, make_shard, tmp_path):
+def test_rows_are_counted_by_the_grasp_type_asked(make_shard, tmp_path):
     """All rows of a shard were asked for one; merging keeps it."""
     for i, steered in enumerate(
         ({"grasp_type": "tripod"}, {}, {"grasp_type": "palmar-pinch"}, {"grasp_type": "tripod"})
@@ -135,9 +135,8 @@ def test_rows_are_counted_by_the_grasp_type_asked(make, make_shard, tmp_path):
         shard = make_shard(3 + i, shard_index=i)
         config = {"steered": steered} if steered else {}
         write_shard(tmp_path / "in" / f"{i}.h5", replace(shard, header=replace(shard.header, config=config)))
-    numbers, text = make(tmp_path / "in")
+    numbers, _ = read_dataset(tmp_path / "in")
     assert numbers["hands"][0]["grasp_types"] == {"": 4, "palmar-pinch": 5, "tripod": 9}
-    assert "none asked 4, palmar-pinch 5, tripod 9" in text
     merge_shards([tmp_path / "in" / f"{i}.h5" for i in (0, 3)], tmp_path / "all.h5")
     assert read_dataset(tmp_path / "all.h5")[0]["hands"][0]["grasp_types"] == {"tripod": 9}
 
@@ -181,7 +180,7 @@ def test_near_duplicates(make_shard, tmp_path):
     assert (near["compared"], near["duplicates"], near["share"]) == (300, dropped, dropped / 300)
 
 
-def test_several_objects_are_near_together(make, make_shard, tmp_path):
+def test_several_objects_are_near_together(make_shard, tmp_path):
     """Both objects and the joints must be near; one that moved makes another grasp."""
     shard = make_shard(20, objects=2, columns=2)
     rows = shard.grasps
@@ -192,8 +191,7 @@ def test_several_objects_are_near_together(make, make_shard, tmp_path):
     metrics = {name: np.concatenate([v] * 3) for name, v in rows.metrics.items()}
     tripled = replace(rows, **(twice | {"object_pose": pose}), metrics=metrics, physics={}, physics_protocols={})
     write_shard(tmp_path / "a.h5", replace(shard, grasps=tripled))
-    numbers, text = make(tmp_path / "a.h5")
-    check_page(text)
+    numbers, _ = read_dataset(tmp_path / "a.h5")
     groups = {tuple(g["objects"]): g for g in numbers["hands"][0]["objects"]}
     assert len(groups) > 3
     for names, group in groups.items():
@@ -236,7 +234,8 @@ def test_hands_and_names(make, make_shard, tmp_path):
     one, two = make_shard(8, objects=2), make_shard(5, shard_index=1)
     odd = replace(one.objects[1], id="<b>&$x$_碗")
     scaled = replace(two.objects[0], scale=0.07)
-    write_shard(tmp_path / "a.h5", replace(one, objects=[odd, one.objects[0]]))
+    asked = replace(one.header, config={"steered": {"grasp_type": "tripod"}})
+    write_shard(tmp_path / "a.h5", replace(one, header=asked, objects=[odd, one.objects[0]]))
     write_shard(tmp_path / "sub" / "a.h5", replace(two, hand=replace(two.hand, name="<other>", sha256="c" * 64)))
     write_shard(tmp_path / "b.h5", replace(two, objects=[scaled]))
     numbers, text = make(tmp_path)
@@ -245,6 +244,7 @@ def test_hands_and_names(make, make_shard, tmp_path):
     assert names == {"<b>&$x$_碗", "cup (scale 0.05)", "cup (scale 0.07)"}
     assert "<b>&$" not in text
     assert "&lt;other&gt;" in text
+    assert "none asked 5, tripod 8" in text
     assert any("<b>&$x$_碗" in "".join(chart.itertext()) for chart in check_page(text))
 
 
@@ -383,9 +383,6 @@ def test_command(make_shard, tmp_path):
     assert (numbers["rows"], held["rows"], held["spaces"]) == (4, 4, {})
     text = out.read_text(encoding="utf-8")
     assert "Objects in the hand" not in text
-    printed = CliRunner().invoke(app, ["report", str(tmp_path / "in"), "-o", str(out), "--json", "-"])
-    assert json.loads(printed.stdout) == numbers
-    assert out.read_text(encoding="utf-8") == text
     check_page(text)
     refused = CliRunner().invoke(app, ["report", str(tmp_path / "in"), "-o", str(tmp_path)])
     assert isinstance(refused.exception, OutputError)

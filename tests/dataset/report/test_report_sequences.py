@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import read_shard
-from lgrasp.dataset.report.write import read_dataset, report_dataset
+from lgrasp.dataset.report.write import read_dataset
 from lgrasp.dataset.writer import write_shard
 from lgrasp_cli.dataset import app
 
@@ -34,14 +34,14 @@ def folder(tmp_path_factory, make_sequence):
 
 @pytest.fixture(scope="module")
 def reported(folder):
-    """The numbers of their report, and the page."""
-    page = folder.parent / "r.html"
-    return report_dataset(folder, page), page.read_text(encoding="utf-8")
+    """The numbers of their report, the page, and what the command says."""
+    page, numbers = folder.parent / "r.html", folder.parent / "r.json"
+    done = CliRunner().invoke(app, ["report", str(folder), "--out", str(page), "--json", str(numbers)])
+    return json.loads(numbers.read_text()), page.read_text(encoding="utf-8"), done.stdout
 
 
 def test_numbers_are_those_of_the_rows(folder, reported, tmp_path):
-    numbers, _ = reported
-    json.dumps(numbers, allow_nan=False)
+    numbers, *_ = reported
     merge_shards(folder, tmp_path / "all.h5")
     grasps = read_shard(tmp_path / "all.h5").grasps
     count, holds = (grasps.object_index >= 0).sum(1), grasps.physics["p_holds"]
@@ -65,7 +65,7 @@ def test_numbers_are_those_of_the_rows(folder, reported, tmp_path):
 
 
 def test_page_has_the_tables(reported):
-    _, text = reported
+    _, text, _ = reported
     section = text[text.index("<h3>Objects in the hand</h3>") : text.index("<h3>Physics</h3>")]
     assert re.findall(r"as object (\d)", section) == ["1", "2", "3"]
     for words in ("<td>60</td>", "<td>24</td>", "finger 3", "hold (p)"):
@@ -74,9 +74,8 @@ def test_page_has_the_tables(reported):
     assert "cup + mug é" in text or "mug é + cup" in text
 
 
-def test_command_says_how_many_objects(folder, tmp_path):
-    done = CliRunner().invoke(app, ["report", str(folder), "--out", str(tmp_path / "r.html")])
-    (line,) = (line for line in done.stdout.splitlines() if line.startswith("objects in the hand"))
+def test_command_says_how_many_objects(reported):
+    (line,) = (line for line in reported[2].splitlines() if line.startswith("objects in the hand"))
     assert line.split(maxsplit=4)[4] == "1: 60, 2: 50, 3: 24"
 
 

@@ -98,7 +98,7 @@ def test_two_balls():
     np.testing.assert_allclose(sums(R, t).numpy() / 8192, [[expected] * 2], rtol=0.01)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1])
 def test_derivatives_equal_finite_differences(scene, seed):
     sums = PenetrationSums(*scene, 3, dtype=torch.float64)
     R, t = poses(2, seed)

@@ -71,7 +71,7 @@ def test_grasps_at_moved_poses_follow_those_of_their_block(power, driver):
     assert len(rows) > 1.3 * len(none) > 20
     assert len(np.unique(rows.pose, axis=0)) == len(rows)
     # and do not depend on how the stream is cut
-    parts = [grasp_arrays(run_batch(power, driver, first, size).grasps) for first in range(0, 6 * size, size)]
+    parts = [grasp_arrays(run_batch(power, driver, first, 2 * size).grasps) for first in range(0, 6 * size, 2 * size)]
     for name, values in grasp_arrays(rows).items():
         np.testing.assert_array_equal(values, np.concatenate([part[name] for part in parts]), err_msg=name)
 

@@ -77,17 +77,17 @@ def test_needs_a_scene_and_a_known_protocol(grasps, context, swift):
 def test_generated_rows_hold(job, swift, tmp_path, raw_grasps):
     """The shard holds what simulating it again gives; batches and threads change nothing; its folder is its own."""
     checked = swift.with_params("search", per_pose=1, restarts=2).with_simulation("gravity6")
-    kwargs = {"object": "sphere", "rows": 2, "shard_rows": 2, "batch": 4}
+    kwargs = {"object": "sphere", "rows": 1, "shard_rows": 1, "batch": 2}
     outcome = generate(job(**kwargs, pipeline=checked))
     shard = read_shard(outcome.paths[0])
     physics = shard.grasps.physics
     assert physics["gravity6_holds"].all()
-    assert len(shard.grasps) == 2
+    assert len(shard.grasps) == 1
     again = verdicts(scene_of(shard.hand, shard.objects), shard.grasps, PROTOCOLS["gravity6"])
     for name, values in again.items():
         np.testing.assert_array_equal(physics[name], values, err_msg=name)
     tried, held = (int(shard.statistics[f"simulate_{name}"]) for name in ("tried", "held"))
-    assert tried >= held >= 2
+    assert tried >= held >= 1
     other = generate(job(**kwargs | {"batch": 3, "workers": 2, "out": tmp_path / "other"}, pipeline=checked))
     assert raw_grasps(other.paths[0].parent) == raw_grasps(outcome.paths[0].parent)
     with pytest.raises(OutputError, match="another run"):

@@ -195,7 +195,7 @@ def test_contacts_lie_on_links_of_their_finger(source, power, finger_posture, li
         local = {k: X[i, k, :3, :3].T @ (p - X[i, k, :3, 3]) for k in links}
         return {k: abs(link_distance(k, at[None])[0]) for k, at in local.items()}
 
-    for i in range(0, len(row), 5):
+    for i in range(0, len(row), 10):
         main = gaps(i, arrays["surface"][row[i], group[i], slot[i]])
         assert main[int(first[i])] < bounds.max_gap + 1e-4
         further = arrays["further"][row[i], group[i], slot[i]]
