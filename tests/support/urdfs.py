@@ -70,6 +70,25 @@ def fingers(folder: Path, count: int, tip: str = BAR, upper: float = 1.5) -> Pat
     return path
 
 
+def rods(folder: Path) -> Path:
+    """Two fingers in a row and a thumb that faces them, of three rods with flat ends; they bend to -y of a link."""
+    rod = '<link name="{n}"><collision><origin xyz="0 0 0.0175"/><geometry><cylinder radius="0.008" length="0.035"/>'
+    hinge = (
+        '<joint name="{n}_joint" type="revolute"><parent link="{p}"/><child link="{n}"/>'
+        '<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="1 0 0"/><limit lower="-0.2" upper="1.6"/></joint>'
+    )
+    places = {"f": ("0.03 0 0.045", "0 0 0"), "g": ("-0.03 0 0.045", "0 0 0"), "t": ("0 -0.02 -0.02", "-1.2 0 3.1416")}
+    parts = []
+    for name, (xyz, rpy) in places.items():
+        for i in range(3):
+            at = {"xyz": "0 0 0.035", "rpy": "0 0 0"} if i else {"xyz": xyz, "rpy": rpy}
+            parts.append(rod.format(n=f"{name}{i}") + "</geometry></collision></link>")
+            parts.append(hinge.format(n=f"{name}{i}", p=f"{name}{i - 1}" if i else "base", **at))
+    path = folder / "rods.urdf"
+    path.write_text(f'<robot name="rods">{BASE.replace("0.04 0.1 0.03", "0.08 0.02 0.09")}{"".join(parts)}</robot>')
+    return path
+
+
 def turned(source: Path, folder: Path, rpy: str, *, mirror: bool = False) -> Path:
     """A primitive URDF under a new root, rotated; or its mirror image (x to -x)."""
     robot = etree.parse(str(source)).getroot()

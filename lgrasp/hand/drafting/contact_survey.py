@@ -12,6 +12,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import SAMPLED_POSTURES, Postures, sample_bodies
 from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.surface_visibility import link_surfaces, surface_visibility, tip_point
+from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf
 
 _MIN_TIP_AREA = 5.0e-5  # [m^2] distal half of a fingertip
@@ -19,6 +20,9 @@ _PALM_SPREAD = 45.0  # [degrees]
 _MIN_LINK_AREA = 2.0e-5  # [m^2] contact surface of a link
 _MIN_PALM_AREA = 3.0e-4  # [m^2]
 _PALM_REACH = 0.10  # [m] from the palm to what is held
+_ONE_SIDED_RATIO = 2.0  # ratio of a joint's room to both sides, for it to bend to one
+_CERTAIN_RATIO = 5.0  # of what is seen of a link's back to its front, for its joint to open where it has room
+_MAX_HINGE_COSINE = 0.6  # cosine of a hinge to the direction of what it bends, at most
 
 
 @dataclass(frozen=True)
@@ -103,14 +107,17 @@ def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[S
     """Contact links of one finger.
 
     A finger of three drives or more touches with the distal half of its last body, which it can turn any way, and the
-    rest of the finger stays clear. One of fewer drives needs all its palmar surface, that of the body before included.
+    rest of the finger stays clear; with its sides as well where the end is flat. One of fewer drives needs all its
+    palmar surface, that of the body before included.
     """
     distal = [s for s in surfaces if s.body == tip]
     axis, along, across = _palmar_axes(model, distal, tip)
     if axis is None:
         return []
     if across is not None and len(structure.driven_by(tip)) >= 3:
-        sides = _sides(distal, [(-along, 91.0), (-across, 60.0)], _MIN_TIP_AREA)
+        rounded = sum(s.area * ((s.normals @ along > 0.05) & (s.normals @ across > 0.5)).mean() for s in distal)
+        behind = 91.0 if rounded > _MIN_TIP_AREA else 80.0  # degrees; sides that are square to the end are at 90
+        sides = _sides(distal, [(-along, behind), (-across, 60.0)], _MIN_TIP_AREA)
         if sides:
             return sides
     if across is not None:
@@ -135,8 +142,9 @@ def _palmar_axes(
 ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray | None]:
     """Palmar direction of a body's surface, the direction of its far end, and the part of the first square to that.
 
-    The first is the mean of the normals seen, across the flexion axis, None when none is; the last is None for a body
-    that slides or when the first lies along the second. Unit vectors (3,), body frame.
+    The first is where the body bends to, if its joint bends it to one side; else the mean of the normals seen, across
+    the flexion axis, None when none is. The last is None for a body that slides or when the first lies along the
+    second. Unit vectors (3,), body frame.
     """
     way = tip_point(surfaces, 0.2)
     along = way / max(float(np.linalg.norm(way)), 1e-9)
@@ -147,12 +155,34 @@ def _palmar_axes(
     if model.tree.joint_prismatic[body - 1]:
         return m, along, None
     hinge = model.tree.joint_axis[body - 1].astype(float)
-    flat = m - (m @ hinge) * hinge
-    if abs(hinge @ along) < 0.6 and np.linalg.norm(flat) > 0.35:
-        m = flat / np.linalg.norm(flat)
+    if abs(hinge @ along) < _MAX_HINGE_COSINE:
+        bent = np.cross(hinge, along) * _bend_sign(model.tree, body)
+        if np.any(bent):
+            bent /= np.linalg.norm(bent)
+            if _seen_along(surfaces, -bent) < _CERTAIN_RATIO * _seen_along(surfaces, bent):
+                return bent, along, bent
+        flat = m - (m @ hinge) * hinge
+        if np.linalg.norm(flat) > 0.35:
+            m = flat / np.linalg.norm(flat)
     across = m - (m @ along) * along
     size = float(np.linalg.norm(across))
     return m, along, across / size if size > 0.3 else None
+
+
+def _bend_sign(tree: Tree, body: int) -> int:
+    """To which side of its hinge a body bends: where its joint has most of its room from 0; 0 if to both."""
+    column, multiplier = tree.joint_column[body - 1], tree.joint_mult[body - 1]
+    lower, upper = float(tree.joint_lower[column]), float(tree.joint_upper[column])
+    standing = min(max(0.0, lower), upper)
+    down, up = standing - lower, upper - standing
+    if max(up, down) < _ONE_SIDED_RATIO * min(up, down):
+        return 0
+    return int(np.sign((up - down) * multiplier))
+
+
+def _seen_along(surfaces: list[SurfaceSamples], way: np.ndarray) -> float:
+    """How much of a body's surface is seen, as it appears from a direction [m^2]."""
+    return sum(float((s.seen * np.maximum(s.normals @ way, 0.0)).mean()) * s.area for s in surfaces)
 
 
 def pad_axis(model: HandModel, surfaces: list[SurfaceSamples], tip: int) -> np.ndarray | None:

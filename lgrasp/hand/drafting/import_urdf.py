@@ -31,7 +31,7 @@ from lgrasp.hand.urdf import check_robot, find_mesh, is_mjcf, read_robot
 from lgrasp.paths import cache_dir, user_dir
 
 _UNINFORMATIVE_NAMES = {"hand", "robot", "model", "urdf", "gripper"}
-_DRAFT_VERSION = 3
+_DRAFT_VERSION = 4
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
 

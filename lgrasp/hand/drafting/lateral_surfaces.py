@@ -16,7 +16,6 @@ _PAD_ANGLE, _LATERAL_ANGLE = 60.0, 45.0  # degrees around the axis
 _LATERAL_BODIES = 3  # the last of a finger
 _MIN_NEIGHBOUR_COSINE = 0.5  # cosine of a finger's lateral axis to the way to its neighbour, at least
 _MIN_PARALLEL_COSINE = 0.7  # cosine of neighbours' directions
-_ONE_SIDED_RATIO = 2.0  # ratio of a joint's room to both sides of its open posture, for it to bend to one
 _MAX_HINGE_COSINE = 0.6  # cosine of the last hinge to the finger's direction, at most
 
 
@@ -66,12 +65,11 @@ def _finger(survey: ContactSurvey, model: HandModel, standing: Postures, group: 
     pads, hinges, moved = [], [], np.zeros(model.dofs, bool)
     for tip in tips:
         surfaces = [s for s in survey.surfaces if s.body == tip]
-        R, t = place(surfaces[0])
+        R, _ = place(surfaces[0])
         hinge = R @ tree.joint_axis[tip - 1].astype(float)
         along = R @ _middle(surfaces)
         axis = pad_axis(survey.model, surfaces, tip)
         if not tree.joint_prismatic[tip - 1] and abs(hinge @ along) < _MAX_HINGE_COSINE * np.linalg.norm(along):
-            axis = _flexed(survey, model, tip, R.T @ np.cross(hinge, along), axis)
             hinges.append(hinge)
         pads += [(s, axis) for s in surfaces if axis is not None]
         moved |= model.tree.moving_joints(model.tree.body_of(surfaces[0].link))
@@ -109,22 +107,6 @@ def _placed(model: HandModel, standing: Postures, samples: SurfaceSamples) -> tu
     T[:3, :3], T[:3, 3] = standing.R[0, tree.link_body[index]], standing.t[0, tree.link_body[index]]
     T = T @ tree.T_body_link[index] @ np.linalg.inv(samples.T_body_link)
     return T[:3, :3], T[:3, 3]
-
-
-def _flexed(survey: ContactSurvey, model: HandModel, tip: int, way: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
-    """Direction in which a fingertip closes, (3,) unit, body frame: ``way`` or against it.
-
-    The open posture leaves a joint most of its room to close; where it does not tell, the side that is ``seen`` does.
-    """
-    tree, k = survey.model.tree, tip - 1
-    column = model.tree.joint_names.index(tree.joint_names[tree.joint_column[k]])
-    limits = np.array([model.tree.joint_lower[column], model.tree.joint_upper[column]])
-    room = tree.joint_mult[k] * (limits - model.tree.joint_open[column])
-    down, up = -min(room), max(room)
-    way = way / np.linalg.norm(way)
-    if seen is not None and max(up, down) < _ONE_SIDED_RATIO * min(up, down):
-        return way if way @ seen > 0 else -way
-    return way if up > down else -way
 
 
 def _surfaces(parts: list[tuple[SurfaceSamples, np.ndarray]], angle: float) -> tuple[Surface, ...]:
