@@ -92,6 +92,8 @@ class Grasps(GraspRows):
         """
         from lgrasp.dataset.scenes import SceneRows, draw_rows
 
+        if isinstance(rows, int) and rows < 1:
+            raise ConfigError(f"rows is {rows}; how many (1 or more), or a list of their numbers, is accepted")
         with _files(self) as files:
             found = SceneRows(files)
             return draw_rows(found, found.spread(rows) if isinstance(rows, int) else list(rows), stage=stage, size=size)
@@ -154,7 +156,7 @@ def generate(
 
 def sequence(
     hand: Name,
-    objects: Sequence[Name],
+    objects: Name | Sequence[Name],
     n: int = 256,
     *,
     pipeline: Name | Pipeline = "sequence",
@@ -177,7 +179,8 @@ def sequence(
     from lgrasp.jobs.sequence.job import SequenceJob
 
     what = _asked(hand, n, pipeline, seed, device, workers, out)
-    return _done(SequenceJob, out, objects=tuple(map(str, objects)), scale=str(scale), **what)
+    names = [objects] if isinstance(objects, str | Path) else objects
+    return _done(SequenceJob, out, objects=tuple(map(str, names)), scale=str(scale), **what)
 
 
 def plan(
@@ -193,7 +196,7 @@ def plan(
     """Grasps of an object or a point cloud by local search: one per start that yields a valid plan.
 
     Args:
-        object: name, mesh file, or a cloud of :func:`read_cloud`.
+        object: name, mesh file, file of points (.xyz, .npy, .npz), or a cloud of :func:`read_cloud`.
         model: draws the hands to start from: file of ``lgrasp learn fit --model grasp``, or a name of ``learn list``.
         out: folder for the shard; none: no file.
 
@@ -202,7 +205,9 @@ def plan(
     """
     from lgrasp.jobs.refine.plan import PlanJob
 
-    what: dict[str, Any] = {"cloud": object} if isinstance(object, Cloud) else {"object": str(object), "scale": scale}
+    points = isinstance(object, Cloud) or Path(object).suffix.lower() in {".xyz", ".npy", ".npz"}
+    what: dict[str, Any] = {"cloud" if points else "object": object if points else str(object)}
+    what |= {} if isinstance(object, Cloud) else {"scale": scale}
     what["model"] = None if model is None else str(model)
     return _done(PlanJob, out, hand=str(hand), starts=starts, device=device, **what)
 
@@ -353,6 +358,8 @@ def _files(grasps: Grasps | Name) -> Iterator[tuple[Path, ...]]:
     if not isinstance(grasps, Grasps):
         yield (Path(grasps),)
         return
+    if not len(grasps):
+        raise ConfigError(f"there are {grasps!r}; at least one is needed")
     with _folder(None) as folder:
         folder.mkdir()
         yield (grasps.save(folder / f"{grasps.hand.name}-{grasps.objects[0].id}-00000.h5"),)

@@ -1,6 +1,5 @@
 """``lgrasp dataset`` and ``export``: look at, check, merge and convert grasp files."""
 
-import os
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -208,10 +207,9 @@ def _sums(parts: Iterable[dict[str, int]]) -> Counter[str]:
 
 
 def _places(shards: list[dict[str, Any]]) -> list[str]:
-    """The names of the files; below their common folder if they lie in several."""
-    files = [Path(s["file"]).absolute() for s in shards]
-    top = os.path.commonpath([file.parent for file in files])
-    return [str(file.relative_to(top)) for file in files]
+    from lgrasp.dataset.files import places
+
+    return places(Path(s["file"]) for s in shards)
 
 
 def _shard_table(shards: list[dict[str, Any]]) -> TextTable:

@@ -85,6 +85,6 @@ def _show(data: dict[str, Any]) -> list[Block]:
         ("quality", f"median epsilon {data['epsilon']:.3f}, unresisted load {data['unresisted_load']:.2f}"),
         *took(data, "plans"),
         place(data),
-        following("simulate", data["out"]),
+        following("render" if data["points"] else "simulate", data["out"]),
     ]
     return [pairs]

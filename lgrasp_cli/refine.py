@@ -55,7 +55,8 @@ def _show(data: dict[str, Any]) -> list[Block]:
     rows = [
         (one["hand"], one["object"], *(f"{one[n.replace(' ', '_')]:,}" for n in names[2:])) for one in data["results"]
     ]
-    pairs = [closed(data), *took(data, "rows"), place(data), following("simulate", data["out"])]
+    points = all(one["points"] for one in data["results"])  # which no simulator takes
+    pairs = [closed(data), *took(data, "rows"), place(data), following("render" if points else "simulate", data["out"])]
     return [TextTable(names, rows, right=names[2:]), pairs]
 
 

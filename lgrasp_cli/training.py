@@ -10,7 +10,7 @@ from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Shards, split
 from lgrasp_cli.tables import Answer, TextTable, reporting
 
-Negatives = Annotated[bool, Option("--negatives", help="Include rows whose metric 'valid' is 0.")]
+Negatives = Annotated[bool, Option("--negatives", help="Include rows with metric 'valid' 0.")]
 
 
 @reporting
@@ -19,12 +19,16 @@ def split_rows(
     by: Annotated[str, Option(**one_of(GroupName, "GROUP", "What no two parts share."))],
     out: Annotated[Path, Option("--out", "-o", help="JSON file to write.")] = Path("split.json"),
     shares: Annotated[
-        str, Option(metavar="PART=SHARE,...", help="Parts, and their shares of the rows.")
+        str,
+        Option(
+            metavar="PART=SHARE,...",
+            help="Parts, and shares of the rows: up to 1 together, or whole numbers.",
+        ),
     ] = "train=0.8,val=0.1,test=0.1",
-    seed: Annotated[int, Option(help="Decides which groups go to which part.")] = 0,
+    seed: Annotated[int, Option(help="Decides which groups go where.")] = 0,
     negatives: Negatives = False,
 ) -> Answer:
-    """Write which objects (or hands, or object poses) are for training, validation and test.
+    """Write which objects (hands, object poses) are for training, validation and test.
 
     GraspDataset, GraspIterableDataset and dataset normalisation read the file.
 
@@ -88,6 +92,9 @@ def _shares(text: str) -> dict[str, float]:
             found[name.strip()] = -1.0
     if not all(name and 0 < share < float("inf") for name, share in found.items()):
         raise ConfigError(f"--shares {text}: expected PART=SHARE,... with positive shares, such as train=0.9,test=0.1")
+    total = sum(found.values())
+    if total > 1 + 1e-6 and any(share % 1 for share in found.values()):
+        raise ConfigError(f"--shares {text}: their sum is {total:g}; up to 1 is accepted, or whole numbers")
     return found
 
 

@@ -89,6 +89,22 @@ def test_plan():
     assert 0 < len(lg.plan("barrett", "mug", starts=3, device="cpu")) <= 3
 
 
+def test_what_cannot_be_used_is_an_error_of_this_package(grasps, tmp_path):
+    none = grasps[np.zeros(len(grasps), bool)]
+    for use in (lg.refine, lg.simulate, lg.Grasps.show):
+        with pytest.raises(lg.LgraspError, match="<0 grasps of sphere by allegro") as caught:
+            use(none)
+        assert "lgrasp." not in str(caught.value)
+    for rows in (0, -3):
+        with pytest.raises(lg.LgraspError, match=f"rows is {rows}; how many"):
+            grasps.show(rows)
+    np.save(tmp_path / "few.npy", np.zeros((3, 3)))
+    with pytest.raises(lg.LgraspError, match=r"few\.npy: .*at least 50"):
+        lg.plan("allegro", tmp_path / "few.npy", device="cpu")
+    with pytest.raises(lg.LgraspError, match="at least two objects, got spere"):
+        lg.sequence("allegro", "spere", device="cpu")
+
+
 def test_sequence():
     pipeline = lg.load_pipeline("sequence")
     pipeline = pipeline.model_copy(update={"field": pipeline.field.model_copy(update={"records": 20_000})})

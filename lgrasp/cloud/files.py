@@ -46,10 +46,10 @@ def read_arrays(path: Path, read_scene: SceneCloud | None) -> dict[str, np.ndarr
     if points.ndim not in (2, 3) or points.shape[-1] not in (3, 6) or points.dtype.kind not in "fiu":
         raise CloudError(
             f"{path}: points are an array of {points.dtype} of shape {points.shape}; numbers of shape (n, 3), "
-            "(n, 6) with normals, or (h, w, 3) are accepted"
+            "(n, 6) with normals or colours, or (h, w, 3) are accepted"
         )
     flat = points.reshape(-1, points.shape[-1]).astype(np.float64)
-    out = {"points": flat[:, :3]} | ({"normals": flat[:, 3:]} if flat.shape[1] == 6 else {})
+    out = {"points": flat[:, :3]} | ({"normals": flat[:, 3:]} if flat.shape[1] == 6 and not _colours(flat) else {})
     for name in found.keys() - {"points", "faces"}:
         values, shape = np.asarray(found[name]), (len(flat), 3) if name == "normals" else (len(flat),)
         if values.size != np.prod(shape):
@@ -58,6 +58,12 @@ def read_arrays(path: Path, read_scene: SceneCloud | None) -> dict[str, np.ndarr
             )
         out[name] = values.reshape(shape).astype(np.float64 if name == "normals" else values.dtype)
     return out | ({"faces": found["faces"]} if "faces" in found else {})
+
+
+def _colours(rows: np.ndarray) -> bool:
+    """Whether the last three of six columns (n, 6) are colours: nowhere negative, and of other lengths than 1."""
+    values = np.nan_to_num(rows[:, 3:])
+    return bool((values >= 0.0).all() and (np.abs(np.linalg.norm(values, axis=1) - 1.0) > 0.01).mean() > 0.1)
 
 
 def read_mask(path: Path, count: int) -> np.ndarray:
@@ -127,7 +133,7 @@ def _parse_numpy(data: bytes) -> dict[str, np.ndarray]:
 
 _PARSERS: dict[str, Callable[[bytes], dict[str, np.ndarray]]] = {
     ".ply": _parse_ply,
-    ".xyz": lambda data: {"points": np.atleast_2d(np.loadtxt(io.StringIO(data.decode()), comments="#"))},
+    ".xyz": lambda data: {"points": np.loadtxt(io.StringIO(data.decode().replace(",", " ")), ndmin=2)},
     ".npy": _parse_numpy,
     ".npz": _parse_numpy,
 }

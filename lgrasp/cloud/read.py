@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
+from lgrasp.cloud import orient
 from lgrasp.cloud.files import SceneCloud, check_labels, read_arrays, read_mask
 from lgrasp.errors import CloudError
 
@@ -66,6 +67,7 @@ def read_cloud(
         scale: Factor from the file's unit to metres.
         viewpoint: Where the points were seen from, x y z in the file's frame [m] after scaling. Normals are turned to
             it. Without one, normals that the file lacks are turned to the origin, which must lie outside the cloud.
+            Those of a cloud that shows all sides, as no camera sees it, are turned outwards.
         scene: Without a label it may be a scene, larger than anything that a hand grasps.
         read_scene: Reader of scenes of this project (.h5), such as :func:`lgrasp.scenes.files.scene_cloud`.
 
@@ -91,6 +93,10 @@ def read_cloud(
     normals = None if normals is None else normals[keep]
     target = _target(mask or path, labels, label, masked=mask is not None, count=len(points))
     chosen = label is not None
+    if not (chosen or scene) and labels is not None and np.ptp(labels):
+        notes.append(
+            f"{path}: all points are to be grasped, whatever their label; {_histogram(labels)}; --label takes one"
+        )
     if chosen or not scene:
         target = _without_strays(points, target, notes)
     _check_size(path, points, target, scale, chosen=chosen, scene=scene)
@@ -104,7 +110,8 @@ def _seen(path: Path, points: np.ndarray, notes: list[str], hint: str) -> np.nda
     zero = (points == 0.0).all(axis=1)
     zero &= zero.sum() > 1
     if not finite.any():
-        raise CloudError(f"{path}: all {len(points):,} points are NaN or infinite; finite coordinates are accepted")
+        problem = f"all {len(points):,} points are NaN or infinite" if len(points) else "it has no points"
+        raise CloudError(f"{path}: {problem}; at least {_MIN_POINTS} with finite coordinates are accepted")
     if not finite.all():
         notes.append(f"dropped {int((~finite).sum()):,} of {len(points):,} points that are NaN or infinite")
     if zero.any():
@@ -183,7 +190,7 @@ def _normals(
     viewpoint: Sequence[float] | np.ndarray | None,
     notes: list[str],
 ) -> np.ndarray:
-    """Unit normals (n, 3), from the file or estimated, turned to the viewpoint."""
+    """Unit normals (n, 3), from the file or estimated, turned to the viewpoint, or outwards if that sees not all."""
     seen_from = None if viewpoint is None else np.asarray(viewpoint, np.float64)
     if seen_from is not None and (seen_from.shape != (3,) or not np.isfinite(seen_from).all()):
         raise CloudError(f"viewpoint {viewpoint} cannot be used; x y z of the camera in metres is accepted")
@@ -192,22 +199,31 @@ def _normals(
     missing = length <= 1e-6
     normals = normals / np.where(missing, 1.0, length)[:, None]
     share = f"all {len(points):,}" if missing.all() else f"{int(missing.sum()):,} of {len(points):,}"
-    origin = np.zeros(3) if seen_from is None else seen_from
+    if not missing.any() and seen_from is None:
+        return normals
+    inside = (points.min(axis=0) <= 0.0).all() and (points.max(axis=0) >= 0.0).all()
+    eye = seen_from if seen_from is not None else None if inside else np.zeros(3)
+    around = (eye is None or not orient.seen_from(points, eye)) and orient.shows_all_sides(points)
+    if eye is None and not around:
+        raise CloudError(
+            f"{path}: {share} points have no normals, and the origin lies inside the cloud, so it is no camera; "
+            "give its position as --viewpoint X,Y,Z"
+        )
     if missing.any():
-        if seen_from is None and (points.min(axis=0) <= 0.0).all() and (points.max(axis=0) >= 0.0).all():
-            raise CloudError(
-                f"{path}: {share} points have no normals, and the origin lies inside the cloud, so it is no camera; "
-                "give its position as --viewpoint X,Y,Z"
-            )
-        normals[missing] = _estimated(points)[missing]
-        normals[missing & _facing_away(points, normals, origin)] *= -1.0
-        told = "the origin, where a camera is supposed" if seen_from is None else "the viewpoint"
-        notes.append(f"normals of {share} points estimated from neighbours and turned to {told}")
-    if seen_from is not None:
-        away = _facing_away(points, normals, origin)
-        normals[away] *= -1.0
-        if away.any():
-            notes.append(f"turned {int(away.sum()):,} normals that pointed away from the viewpoint")
+        made = _estimated(points)
+        made = orient.outward(points, made) if around or eye is None else _facing(points, made, eye)
+        normals[missing] = made[missing]
+        told = "to the origin, where a camera is supposed" if seen_from is None else "to the viewpoint"
+        told = "outwards: the cloud shows all sides (thin walls may be taken wrongly)" if around else told
+        notes.append(f"normals of {share} points estimated from neighbours and turned {told}")
+    if seen_from is not None and around:
+        notes.append("the viewpoint is not used: from nowhere can all of these points be seen")
+    elif seen_from is not None:
+        turned = _facing(points, normals, seen_from)
+        away = int((turned != normals).any(axis=1).sum())
+        normals = turned
+        if away:
+            notes.append(f"turned {away:,} normals that pointed away from the viewpoint")
     return normals
 
 
@@ -222,5 +238,6 @@ def _estimated(points: np.ndarray) -> np.ndarray:
     return out
 
 
-def _facing_away(points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
-    return np.einsum("nd,nd->n", normals, viewpoint - points) < 0.0
+def _facing(points: np.ndarray, normals: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """Normals turned to the side of a place."""
+    return np.where(np.einsum("nd,nd->n", normals, eye - points) < 0.0, -1.0, 1.0)[:, None] * normals

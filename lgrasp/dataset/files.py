@@ -87,6 +87,13 @@ def named_files(paths: Paths) -> list[Path]:
     return [path for path in _given(paths) if not path.is_dir()]
 
 
+def places(paths: Iterable[Path]) -> list[str]:
+    """The names of files; below their common folder if they lie in several."""
+    files = [path.absolute() for path in paths]
+    top = os.path.commonpath([file.parent for file in files])
+    return [str(file.relative_to(top)) for file in files]
+
+
 def _given(paths: Paths) -> list[Path]:
     return [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
 

@@ -203,3 +203,12 @@ def stored_bounds(config: Mapping[str, Any]) -> GraspBounds:
         if "friction" in stage.get("filter", {}):
             return GraspBounds(friction=stage["filter"]["friction"])
     return GraspBounds()
+
+
+def measured_strictly(config: Mapping[str, Any]) -> bool:
+    """Whether rows of a shard can be strictly valid, by its ``config``: forces were balanced with no more than the
+    strict friction, as far as it says."""
+    try:
+        return stored_bounds(config).friction <= GraspBounds().friction
+    except (AttributeError, KeyError, TypeError, ValueError):  # of another writer
+        return True

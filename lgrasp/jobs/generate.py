@@ -20,6 +20,7 @@ from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run
 from lgrasp.engine.run import run
 from lgrasp.engine.shard import Execution, gave_up, make_shard
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
+from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.rows import grasp_rows
@@ -64,6 +65,11 @@ class GenerateJob(GenerateRequest, SearchJob):
     def object_name(self) -> str:
         assert self.keys.mesh is not None
         return self.keys.mesh.stem
+
+    @property
+    def object_hashes(self) -> set[str]:
+        assert self.keys.mesh is not None
+        return {mesh_digest(mesh_bytes(self.keys.mesh))}
 
     @property
     def protocol(self) -> str | None:

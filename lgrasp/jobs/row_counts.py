@@ -10,7 +10,7 @@ import numpy as np
 
 from lgrasp.dataset.info import stage_counts
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.grasp.bounds import GraspBounds, stored_bounds
+from lgrasp.grasp.bounds import GraspBounds, measured_strictly
 from lgrasp.grasp.pose_numbers import pose_numbers
 from lgrasp.grasp.records import GraspRows
 from lgrasp.runtime.tally import add_counts
@@ -60,9 +60,9 @@ def count_written(paths: Collection[Path], moving: np.ndarray) -> tuple[Counter[
 
 def strict_rows(column: _Column, config: Mapping[str, Any]) -> int:
     """Rows within the strict bounds; none where friction was taken to be higher, since forces were balanced with it."""
-    strict = GraspBounds()
-    if stored_bounds(config).friction > strict.friction:
+    if not measured_strictly(config):
         return 0
+    strict = GraspBounds()
     return int(strict.met_by({name: column(f"metrics/{name}") for name in strict.limits}).sum())
 
 

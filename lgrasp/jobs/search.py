@@ -15,6 +15,7 @@ from lgrasp.engine.run import Job
 from lgrasp.engine.shard import flat_statistics
 from lgrasp.grasp.records import GraspRows, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs
 from lgrasp.jobs.requests.search import SearchRequest
@@ -27,7 +28,6 @@ class SearchJob(SearchRequest, Job):
     """Shards of grasps by one hand, perhaps of fewer rows than requested."""
 
     asks: ClassVar[bool] = True
-    differs: ClassVar[str] = "other contents of the hand's or an object's files"
 
     _keys: Any = PrivateAttr(None)
     _inputs: Any = PrivateAttr(None)
@@ -37,6 +37,11 @@ class SearchJob(SearchRequest, Job):
     @abstractmethod
     def object_name(self) -> str:
         """What is grasped, in the names of files."""
+
+    @property
+    @abstractmethod
+    def object_hashes(self) -> set[str] | None:
+        """SHA-256 of what is grasped; None where only loading tells."""
 
     @property
     @abstractmethod
@@ -116,7 +121,16 @@ class SearchJob(SearchRequest, Job):
 
     def difference(self, path: Path) -> str:
         with ShardReader(path) as reader:
-            return config_difference(reader.header.config, self.config()) or self.differs
+            return config_difference(reader.header.config, self.config()) or self._other_files(reader)
+
+    def _other_files(self, reader: ShardReader) -> str:
+        hand, urdf = reader.hand(), self.keys.source.urdf
+        changed = {
+            "the hand's files": (hand.urdf, dict(hand.meshes)) != (read_urdf(urdf).text, mesh_blobs(urdf)),
+            "an object's file": self.object_hashes not in (None, {sha256 for _, sha256, _ in reader.object_keys}),
+        }
+        told = " and ".join(what for what, other in changed.items() if other)
+        return f"other contents of {told}" if told else "what differs cannot be told"
 
     def shard(self, part: Part, result: Any, grasps: GraspRows, statistics: dict[str, Any]) -> Shard:
         """A result as records, with what the job says of it in ``statistics``."""

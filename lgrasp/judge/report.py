@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -143,12 +144,13 @@ class Report(JudgedRows):
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterable[str]:
-        width = max(5, *(len(s.path.name) for s in self.shards))
+        places = _places([s.path for s in self.shards])
+        width = max(5, *map(len, places))
         yield f"{'shard':<{width}}{'rows':>8}{'valid':>8}{'share':>10}  failing checks: rows (worst, bound)"
-        for s in self.shards:
+        for s, place in zip(self.shards, places, strict=True):
             d = s.to_dict()
             share = f"{100.0 * d['valid_rows'] / d['rows']:.2f} %" if d["rows"] else "-"
-            line = f"{s.path.name:<{width}}{d['rows']:>8}{d['valid_rows']:>8}{share:>10}  "
+            line = f"{place:<{width}}{d['rows']:>8}{d['valid_rows']:>8}{share:>10}  "
             line += ", ".join(
                 f"{check} {n['rows']}" + (f" ({n['worst']:.3g}, {n['bound']:.3g})" if "worst" in n else "")
                 for check, n in d["failures"].items()
@@ -173,6 +175,13 @@ class Report(JudgedRows):
         if self.self_pairs:
             yield "self-penetrating pairs: " + ", ".join(f"{k} {v}" for k, v in list(self.self_pairs.items())[:12])
         yield from (f"note: {note}" for note in self.notes)
+
+
+def _places(paths: Sequence[Path]) -> list[str]:
+    """The files, below their common folder."""
+    files = [path.absolute() for path in paths]
+    top = os.path.commonpath([file.parent for file in files])
+    return [str(file.relative_to(top)) for file in files]
 
 
 def _joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -24,6 +24,7 @@ from lgrasp.object.params import ObjectParams
 from lgrasp.paths import check_file
 
 _FLAT = 1e-4  # thinner than this share of the largest side is a plane
+_ROUNDING = 1e-4  # of a largest side, by files of single precision
 _MOST_UNPACKED = 256 << 20
 _UNITS = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"))
 
@@ -198,7 +199,7 @@ def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarr
 def _check_size(label: str, vertices: np.ndarray, scale: float, params: ObjectParams) -> None:
     """Refuse extents that a unit mistake explains, and planes."""
     extent = float(np.ptp(vertices, axis=0).max())
-    if extent > params.max_extent or extent < params.min_extent:
+    if not params.min_extent * (1 - _ROUNDING) <= extent <= params.max_extent * (1 + _ROUNDING):
         side = f"largest side is {extent:.4g} m" + ("" if scale == 1.0 else f" at scale {scale:g}")
         accepted = f"{params.min_extent:g} to {params.max_extent:g} m is accepted"
         raise ObjectError(f"{label}: {side}; {accepted}{_remedy(extent, scale)}")

@@ -69,21 +69,41 @@ def test_ply_of_trimesh(tmp_path, ball):
 @pytest.mark.parametrize("name", ["ball.npy", "ball.npz", "ball.xyz"])
 def test_normals_are_estimated_and_face_the_camera(ball, name):
     write, points, normals = ball
-    cloud = read_cloud(write(name))  # a camera at the origin
-    facing = np.einsum("nd,nd->n", normals, -points)
-    sign = np.where(facing < 0, -1.0, 1.0)[:, None]
-    cosine = np.einsum("nd,nd->n", cloud.normals, normals * sign)
-    sure = np.abs(facing) > 0.2 * np.linalg.norm(points, axis=1)  # not beside the silhouette
-    assert cosine[sure].min() > np.cos(np.radians(10.0))
-    assert any("estimated" in note for note in cloud.notes)
+    seen = np.einsum("nd,nd->n", normals, -points) > 0.2 * np.linalg.norm(points, axis=1)  # by a camera at the origin
+    cloud = read_cloud(write(name, lambda p: p[seen]))
+    assert np.einsum("nd,nd->n", cloud.normals, normals[seen]).min() > np.cos(np.radians(15.0))
+    assert any("estimated" in note and "camera" in note for note in cloud.notes)
+
+
+@pytest.mark.parametrize("viewpoint", [None, [0.5, 0.3, -0.2]])
+def test_normals_of_a_cloud_from_all_sides_are_turned_outwards(ball, viewpoint):
+    write, _, normals = ball
+    for change in (lambda p: p, lambda p: p - CENTRE):
+        cloud = read_cloud(write("ball.npy", change), viewpoint=viewpoint)
+        assert np.einsum("nd,nd->n", cloud.normals, normals).min() > np.cos(np.radians(15.0))
+        assert any("estimated" in note and "outwards" in note for note in cloud.notes)
 
 
 def test_given_normals_are_turned_to_the_viewpoint(ball):
     write, _, normals = ball
-    cloud = read_cloud(write("ball.npz", normals=-normals), viewpoint=[0.1, -0.2, 5.0])
     up = normals[:, 2] > 0.1
-    np.testing.assert_allclose(cloud.normals[up], normals[up], atol=1e-6)
+    path = write("ball.npz", lambda p: p[up], normals=-normals[up])
+    cloud = read_cloud(path, viewpoint=[0.1, -0.2, 5.0])
+    np.testing.assert_allclose(cloud.normals, normals[up], atol=1e-6)
     assert any("turned" in note for note in cloud.notes)
+    whole = read_cloud(write("ball.npz", normals=normals), viewpoint=[0.1, -0.2, 5.0])
+    np.testing.assert_allclose(whole.normals, normals, atol=1e-6)
+
+
+def test_colours_are_no_normals(ball):
+    write, points, normals = ball
+    colours = np.random.default_rng(0).integers(0, 256, points.shape)
+    path = write("ball.xyz", lambda p: np.hstack([p, colours]))
+    assert np.einsum("nd,nd->n", read_cloud(path).normals, normals).min() > np.cos(np.radians(15.0))
+    path.write_text(path.read_text().replace(" ", ","))
+    np.testing.assert_allclose(read_cloud(path).points, points, atol=1e-6)
+    given = read_cloud(write("ball.xyz", lambda p: np.hstack([p, normals])))
+    np.testing.assert_allclose(given.normals, normals, atol=1e-6)
 
 
 def test_some_missing_normals_are_filled(ball):
@@ -178,7 +198,8 @@ def fill(value):
         (lambda p: 1000 * p, {}, "millimetres use --scale 0.001"),
         (lambda p: p, {"scale": 0.001}, "in metres already: use --scale 1"),
         (lambda p: p, {"scale": -1}, "scale -1 cannot be used"),
-        (lambda p: p - CENTRE, {}, "give its position as --viewpoint"),
+        (lambda p: (p - CENTRE)[p[:, 2] > CENTRE[2] - 0.01], {}, "give its position as --viewpoint"),
+        (lambda p: p[:0], {}, "it has no points; at least 50"),
         (lambda p: p, {"viewpoint": [0, 0]}, "x y z of the camera"),
         (lambda p: p, {"label": 1}, "has no labels; give --mask"),
         (lambda p: p[:, :2], {}, "shape (2000, 2)"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
+from typer.testing import CliRunner
 
 from lgrasp.dataset.normalisation import Normalisation
 from lgrasp.dataset.reader import read_shard
@@ -17,6 +18,7 @@ from lgrasp.dataset.torch_stream import GraspIterableDataset
 from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp_cli.dataset import app
 
 SIZES = (420, 40, 60, 0, 30, 20)
 ROWS = sum(SIZES)
@@ -111,6 +113,16 @@ def test_split_by_hand(folder, tmp_path, make_shard):
     assert [part.rows for part in made.parts.values()] in ([ROWS, 10], [10, ROWS])
     part = next(name for name, told in made.parts.items() if told.names == ("other",))
     assert len(GraspDataset([folder, tmp_path], split=made, part=part)) == 10
+
+
+@pytest.mark.parametrize("shares", ["train=0.5,test=0.6", "train=0.8,val=0.1,test=0.1", "train=4,test=2"])
+def test_shares_of_a_split(folder, tmp_path, shares):
+    """Up to 1, or whole numbers."""
+    asked = ["split", str(folder), "--by", "object", "-o", str(tmp_path / "split.json"), "--shares", shares]
+    result = CliRunner().invoke(app, asked)
+    refused = shares.endswith("0.6")
+    assert isinstance(result.exception, ConfigError) == refused == ("their sum is 1.1;" in str(result.exception))
+    assert (tmp_path / "split.json").exists() != refused
 
 
 def test_split_errors(folder, tmp_path, make_shard):

@@ -21,3 +21,15 @@ def test_names_what_differs():
     moved = config_difference(config(swift, object="a\x1b[2J"), config(swift))
     assert moved == r"object: 'a\x1b[2J' there, mug requested"
     assert config_difference(config(swift), config(swift)) == ""
+
+
+def test_names_steering_that_one_side_lacks():
+    """Steering is stored without its defaults; of other sections a key that is not there has its default."""
+    swift = load_pipeline("swift")
+    cone, wider = (config(swift.with_steering(approach=f"0,0,-1:{angle}")) for angle in (30, 40))
+    assert config_difference(cone, wider) == "steer.approach.angle: 30.0 there, 40.0 requested"
+    palm, fingers = config(swift.with_steering(palm="no")), config(swift.with_steering(fingers="thumb,index"))
+    assert config_difference(config(swift), palm) == "steer.palm: not given there, no requested"
+    assert config_difference(fingers, config(swift)) == "steer.fingers: ['thumb', 'index'] there, not requested"
+    assert config_difference(config(swift), config(swift, negatives=0.5)) == "negatives: not given there, 0.5 requested"
+    assert config_difference(config(swift), config(swift, later={"key": 1})) == ""

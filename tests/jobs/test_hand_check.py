@@ -9,12 +9,14 @@ from matplotlib import image
 from support.places import QUICK
 from support.urdfs import gripper
 
+from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.find import find_hand
+from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.hand_check.check import check_hand, check_objects
 from lgrasp.jobs.hand_check.diagnose import diagnose, field_vectors, hand_findings
 from lgrasp.object.find import find_object
@@ -55,6 +57,16 @@ def test_drafted_gripper_holds_all_three(jaws, tmp_path, cache_root):
     assert 0.001 < red < 0.1  # the jaw, a last link
     assert 0.001 < amber < 0.1  # the static one
     assert grey > 0.005  # their backs
+
+
+def test_a_jaw_that_is_the_base_stands_in_for_a_finger(small_job, tmp_path):
+    """Both jaws have one drive: contacts are that of the other jaw and the palm's."""
+    jaws = import_urdf(gripper(tmp_path, mimic=True), out=tmp_path / "jaws").folder
+    more = {"hand": str(jaws), "object": "sphere", "scale": 0.6, "rows": 5, "out": tmp_path / "out"}
+    outcome = generate(GenerateJob(**small_job | more))
+    assert outcome.rows == 5
+    links = read_shard(outcome.paths[0]).grasps.contact_links[:, 0]
+    assert ((links >= 0).sum(1) == 2).all()
 
 
 def share_of_colours(picture: Path) -> tuple[float, ...]:

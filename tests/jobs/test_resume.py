@@ -66,6 +66,18 @@ def test_deleted_shards_are_made_again(run, whole, raw_grasps):
     assert raw_grasps(whole) == expected
 
 
+def test_changed_files_are_told_where_they_are(job, whole):
+    """Of a run with the same settings."""
+    path, asked = min(whole.glob("*.h5")), job(rows=60, out=whole)
+    assert asked.difference(path) == "what differs cannot be told"
+    with h5py.File(path, "r+") as file:
+        next(iter(file["objects"].values())).attrs["sha256"] = "0" * 64
+    assert asked.difference(path) == "other contents of an object's file"
+    with h5py.File(path, "r+") as file:
+        file["hand/urdf"][()] = file["hand/urdf"].asstr()[()] + "\n"
+    assert asked.difference(path) == "other contents of the hand's files and an object's file"
+
+
 def test_nothing_to_do(run, whole):
     again = run(rows=60, out=whole)
     assert (again.made, again.present, again.rows) == (0, 60, 60)

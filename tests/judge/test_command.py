@@ -45,7 +45,7 @@ def test_table_json_and_exit_code(tmp_path):
     write_shard(tmp_path / "sub" / "bad.h5", [row(), row(pose=[0, 0, 0.005, 1, 0, 0, 0])])
     result = run(tmp_path, "--json", tmp_path / "out.json")
     assert result.exit_code == 1
-    assert "bad.h5 2 1 50.00 % penetration 1 (5, 2); made for profile plan" in " ".join(result.stdout.split())
+    assert " sub/bad.h5 2 1 50.00 % penetration 1 (5, 2); made for profile plan" in " ".join(result.stdout.split())
     found = json.loads((tmp_path / "out.json").read_text())
     assert [s["valid_rows"] for s in found["shards"]] == [2, 1]
     assert found["shards"][1]["failures"] == {"penetration": {"rows": 1, "worst": pytest.approx(5.0), "bound": 2.0}}

@@ -59,6 +59,7 @@ def test_the_hand_is_that_of_the_network(cli, monkeypatch):
 def test_cloud_is_stored(cli, cloud, tmp_path):
     found = cli("plan", "--cloud", cloud, "--label", 3, *QUICK, "--out", tmp_path / "out")
     assert found.code == 0, found
+    assert f"lgrasp render {tmp_path / 'out'}" in found.out  # no simulator takes points
     (path,) = (tmp_path / "out").glob("*.h5")
     assert validate_shard(path) == []
     shard = read_shard(path)

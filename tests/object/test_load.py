@@ -128,6 +128,13 @@ def test_units(factor, unit, remedy):
     assert np.ptp(scaled.vertices, axis=0) == pytest.approx(BOX.extents)
 
 
+@pytest.mark.parametrize(("side", "beyond"), [(0.005, 0.999), (1.0, 1.001)])
+def test_limits_of_the_size_forgive_rounding(side, beyond):
+    for share in (np.float32(0.9999999), np.float32(1.0000001)):
+        load_mesh(trimesh.creation.box(extents=[side * float(share)] * 3))
+    assert "is accepted" in refused(trimesh.creation.box(extents=[side * beyond] * 3))
+
+
 def test_scale_of_a_mesh_in_metres_and_bad_scales():
     assert "--scale 1" in refused(BOX, scale=0.001)
     for scale in (0.0, -1.0, float("nan"), float("inf")):

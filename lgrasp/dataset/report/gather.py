@@ -13,6 +13,7 @@ from lgrasp.dataset.report.diversity import GraspSpread, TouchedSurface
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.verdicts import HeldRows, Verdicts, add_held, add_verdicts
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.grasp.bounds import measured_strictly
 from lgrasp.grasp.duplicates import KeptRows, near_pairs
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 
@@ -153,7 +154,7 @@ class HandRows:
         Raises:
             ShardError: The file is damaged.
         """
-        records = reader.objects()
+        records, strict = reader.objects(), measured_strictly(reader.header.config)
         for start in range(0, len(reader), _BLOCK_ROWS):
             rows = reader.rows(start, start + _BLOCK_ROWS)
             q, links = rows.q.astype(float), rows.contact_links
@@ -163,7 +164,8 @@ class HandRows:
             self.links += np.bincount(links[links >= 0], minlength=len(self.links))
             add_held(self.held, rows)
             for index in np.unique(rows.object_index, axis=0):
-                self._add_rows(rows, np.flatnonzero((rows.object_index == index).all(1)), index, records, labels)
+                chosen = np.flatnonzero((rows.object_index == index).all(1))
+                self._add_rows(rows, chosen, index, records, labels, strict)
             advanced(start + len(rows))
 
     def together(self) -> dict[str, Distribution]:
@@ -202,6 +204,7 @@ class HandRows:
         index: np.ndarray,
         records: tuple[ObjectRecord, ...],
         labels: list[str],
+        strict: bool,
     ) -> None:
         """Some rows, by their numbers, that hold the same objects in the same order, ``index`` [O]."""
         present = np.flatnonzero(index >= 0)
@@ -210,7 +213,7 @@ class HandRows:
         group.rows += len(chosen)
         for name, distribution in group.quantities.items():
             if name in rows.metrics:
-                distribution.add(rows.metrics[name][chosen])
+                distribution.add(rows.metrics[name][chosen], strict=strict)
             else:
                 distribution.missing += len(chosen)
         group.contacts.update((rows.contact_links[chosen] >= 0).sum((1, 2)).tolist())

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from lgrasp.dataset.files import Paths, check_heaps
+from lgrasp.dataset.files import Paths, check_heaps, places
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
+from lgrasp.grasp.bounds import GraspBounds, measured_strictly
 from lgrasp.grasp.records import ShardHeader
 from lgrasp.words import listed
 
@@ -82,17 +83,24 @@ def _label(key: tuple[str, str, float], others: set[tuple[str, str, float]]) -> 
 
 
 def _remarks(heads: list[Head]) -> list[str]:
-    """Rows that are there twice; empty shards."""
+    """Rows that are there twice; empty shards; those made with a higher friction."""
     holder: dict[tuple[str, int], Path] = {}
     twice: set[str] = set()
     for head in heads:
         twice |= {f"{head.path} repeats the rows of {holder[part]}" for part in head.parts if part in holder}
         for part in head.parts:
             holder.setdefault(part, head.path)
-    empty = [head.path.name for head in heads if not head.rows]
+    names = places(head.path for head in heads)
+    empty = [name for name, head in zip(names, heads, strict=True) if not head.rows]
+    rough = [name for name, head in zip(names, heads, strict=True) if not measured_strictly(head.header.config)]
     remarks = []
     if twice:
         remarks.append(f"{listed(sorted(twice), 3)}; they are counted twice.")
     if empty:
         remarks.append(f"No rows are in {listed(empty, 3)}.")
+    if rough:
+        remarks.append(
+            f"Friction was above the strict {GraspBounds().friction:g} in {listed(rough, 3)}: grasps there count as "
+            "above the bound of gswo."
+        )
     return remarks

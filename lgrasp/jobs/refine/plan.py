@@ -148,10 +148,12 @@ class PlanJob(PlanRequest, Job):
         return {"network": network_key(find_network(str(self.model)))}
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
-        """``grasps``, ``starts``, ``counts`` (what became of the starts), medians of ``epsilon`` and
-        ``unresisted_load``, ``seconds_planning``, ``force_closure`` (share), ``valid`` by the bounds of ``profile``."""
+        """``grasps``, ``starts``, ``points`` (the object is a cloud), ``counts`` (what became of the starts), medians
+        of ``epsilon`` and ``unresisted_load``, ``seconds_planning``, ``force_closure`` (share), ``valid`` by the bounds
+        of ``profile``."""
         _, hand, model, _ = self._models()
         data: dict[str, Any] = {"hand": hand.name, "object": model.name, "starts": self.starts, "grasps": outcome.rows}
+        data["points"] = self.cloud is not None
         data |= {"profile": self.params.bounds.profile, "force_closure": closure_share(outcome.paths)}
         data |= {"counts": {}, "seconds_planning": 0.0, "epsilon": None, "unresisted_load": None, "valid": 0}
         for result in outcome.results:

@@ -139,8 +139,8 @@ class RefineJob(RefineRequest, ShardJob):
         return Made(len(moved.rows), self.marked(part, refined, counts))
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
-        """``results``: of each shard hand, object, rows, refined, valid before and after, mean energies, seconds;
-        ``force_closure`` (share)."""
+        """``results``: of each shard hand, object, ``points`` (it is a cloud), rows, refined, valid before and after,
+        mean energies, seconds; ``force_closure`` (share)."""
         return {
             "results": [_entry(path) for path in outcome.paths],
             "force_closure": closure_share(outcome.paths),
@@ -166,12 +166,13 @@ def _entry(path: Path) -> dict[str, Any]:
         statistics, attributes = reader.statistics, reader.attributes
         profile = stored_bounds(reader.header.config).profile
         refined, valid, energy = (reader.column(f"metrics/{name}") for name in ("refined", "valid", "energy"))
-        rows, objects = len(reader), reader.object_ids
+        rows, objects = len(reader), reader.objects()
     tried = max(int(statistics["refine_tried"]), 1)
     return {
         "shard": str(path),
         "hand": str(attributes["hand"]),
-        "object": ", ".join(objects),
+        "object": ", ".join(obj.id for obj in objects),
+        "points": not any(len(obj.faces) for obj in objects),
         "rows": rows,
         "refined": int(refined.sum()),
         "valid_before": int(statistics["refine_valid_before"]),

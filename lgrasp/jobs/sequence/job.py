@@ -10,6 +10,7 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found
 from lgrasp.errors import LgraspError, ObjectError, StarvedError
+from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.model import HandModel
@@ -50,6 +51,10 @@ class SequenceJob(SequenceRequest, SearchJob):
             pipeline, size = self.pipeline, parse_size(self.scale)
             self._keys = sequence_keys(self.hand, self.objects, size, pipeline.seed, pipeline.object, pipeline.field)
         return self._keys
+
+    @property
+    def object_hashes(self) -> set[str] | None:
+        return {mesh_digest(mesh_bytes(path)) for path in self.keys.meshes}
 
     def own_config(self) -> dict[str, Any]:
         return {"objects": list(self.names), "scales": list(self.keys.scales), "physics": self.simulate}

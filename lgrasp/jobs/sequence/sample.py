@@ -68,6 +68,10 @@ class SampleJob(SampleRequest, SequenceJob):
             self._keys = replace(super().keys, **about)
         return super().keys
 
+    @property
+    def object_hashes(self) -> set[str] | None:
+        return None if self.clouds else super().object_hashes
+
     def key(self) -> str:
         return content_key("sample", 2, run=super().key(), network=self.network()[2])
 

@@ -91,7 +91,8 @@ def run(inputs: CandidateTable, params: SearchParams, context: Context) -> tuple
     few = _CPU_STARTS if d == "cpu" and not paced else _GPU_STARTS
     starts = params.restarts
     if swap:  # no more than there are sets
-        starts = min(starts, sum(math.comb(groups, k) * keep**k for k in {*params.contacts}))
+        sizes = {min(k, groups) for k in params.contacts}  # where the palm stands in for a finger
+        starts = min(starts, sum(math.comb(groups, k) * keep**k for k in sizes))
     lanes = min(starts, few if params.per_pose < starts else starts)
     room = empty_struct(TriedSets, d, n, min(starts, max(lanes, _MOST_STARTS)) if paced else lanes, groups)
     first = 0

@@ -24,6 +24,8 @@ from lgrasp.dataset.report.write import read_dataset, report_dataset
 from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.grasp.bounds import GraspBounds, measured_strictly
+from lgrasp.jobs.row_counts import strict_rows
 from lgrasp.judge import bounds as judge_bounds
 from lgrasp_cli.dataset import app
 
@@ -157,6 +159,23 @@ def test_merged_rows_give_the_same_numbers(make_shard, tmp_path):
     assert both["rows"] == 94
     assert "counted twice" in both["remarks"][0]
     assert both["hands"][0]["objects"][0]["near_duplicates"]["share"] == 0.5
+    assert both["remarks"][1] == "No rows are in in/1.h5."
+
+
+def test_no_row_of_a_higher_friction_is_below_the_bound(make_shard, tmp_path):
+    """As in what generate counts: forces were balanced with that friction."""
+    for i, friction in enumerate((0.5, 2.0)):
+        shard = make_shard(4, shard_index=i)
+        rows = replace(shard.grasps, metrics={name: np.full(4, 1e-4, "f4") for name in GraspBounds().limits})
+        config = {"bounds": GraspBounds(friction=friction).describe()}
+        assert strict_rows(lambda name, rows=rows: rows.columns()[name], config) == (4 if friction == 0.5 else 0)
+        header = replace(shard.header, config=config)
+        write_shard(tmp_path / f"{i}.h5", replace(shard, header=header, grasps=rows))
+    numbers, _ = read_dataset(tmp_path)
+    over = {name: found["over_bound"] for name, found in numbers["hands"][0]["metrics"].items()}
+    assert over == {"penetration": 0, "gap": 0, "normal_error": 0, "gswo": 4}
+    assert "above the strict 0.5 in 1.h5" in numbers["remarks"][0]
+    assert measured_strictly({"bounds": "of another writer"})
 
 
 def near_shard(make_shard, n, seed):

@@ -1,0 +1,94 @@
+"""Which side of a cloud's surface is its outside: a camera tells, or views from all around it."""
+
+import numpy as np
+from scipy.spatial import ConvexHull, KDTree
+
+from lgrasp.geometry.hulls import spread_directions
+
+_MOST_POINTS = 20_000  # that views look at
+_VIEWS = 40
+_FAR = 3.0  # of a view from the middle, over the cloud's diagonal
+_FLIP = 100.0  # radius of the mirror of _visible, over the farthest point
+_HIDDEN_SHARE = 0.16  # of points behind others, at most, where one camera saw a cloud
+_BEHIND = 5.0  # point spacings
+_NEIGHBOURS, _ROUNDS = 9, 10  # of what is passed on between points
+
+
+def shows_all_sides(points: np.ndarray) -> bool:
+    """Whether no camera can have seen a cloud, (n, 3): from everywhere, points lie behind others."""
+    points = _some(points)
+    eyes = _eyes(points)
+    spacing = _spacing(points)
+    return all(_hidden_share(points, eye, spacing) > _HIDDEN_SHARE for eye in eyes)
+
+
+def seen_from(points: np.ndarray, eye: np.ndarray) -> bool:
+    """Whether a camera at a place, (3,), can have seen a cloud, (n, 3)."""
+    points = _some(points)
+    return _hidden_share(points, eye, _spacing(points)) <= _HIDDEN_SHARE
+
+
+def outward(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3) turned outwards: to those of the views from all around that see a point and its neighbours.
+
+    Visible is what hidden point removal leaves (Katz et al. 2007). Where two surfaces are nearer to each other than a
+    few points, as in a thin wall, it cannot tell them apart.
+    """
+    some = _some(points)
+    index = KDTree(some).query(points)[1]
+    own = np.empty_like(some)
+    own[index] = normals  # of one of the points that are nearest
+    votes = np.zeros(len(some))
+    middle = (some.min(axis=0) + some.max(axis=0)) / 2
+    for eye in _eyes(some):
+        seen = _visible(some, eye)
+        way = eye - middle
+        votes[seen] += own[seen] @ (way / np.linalg.norm(way))
+    tree = KDTree(some)
+    distance, near = tree.query(some, min(_NEIGHBOURS, len(some)))
+    way = (some[near] - some[:, None]) / np.maximum(distance, 1e-12)[..., None]
+    alike = np.einsum("nkd,nd->nk", own[near], own)
+    # a neighbour across an edge or a wall tells little
+    weight = np.maximum(np.abs(alike) - np.abs(np.einsum("nkd,nd->nk", way, own)), 0.0) * np.sign(alike)
+    weight[:, 0] = 1.0
+    for _ in range(_ROUNDS):
+        votes = np.clip((weight * votes[near]).sum(axis=1), -5.0, 5.0)
+    told = np.where(votes < 0.0, -1.0, 1.0)[:, None] * own
+    return np.where(np.einsum("nd,nd->n", told[index], normals) < 0.0, -1.0, 1.0)[:, None] * normals
+
+
+def _some(points: np.ndarray) -> np.ndarray:
+    return points[:: -(-len(points) // _MOST_POINTS)]
+
+
+def _eyes(points: np.ndarray) -> np.ndarray:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return (low + high) / 2 + _FAR * np.linalg.norm(high - low) * spread_directions(_VIEWS)
+
+
+def _spacing(points: np.ndarray) -> float:
+    return float(np.median(KDTree(points).query(points, 2)[0][:, 1]))
+
+
+def _hidden_share(points: np.ndarray, eye: np.ndarray, spacing: float) -> float:
+    """Share of points that lie behind another in the same cell of a picture."""
+    way = points - eye
+    axis = way.mean(axis=0) / np.linalg.norm(way.mean(axis=0))
+    across = np.linalg.svd(axis[None])[2][1:].T
+    depth = way @ axis
+    if (depth <= 0.0).any():
+        return 1.0  # the camera would be among the points
+    cell = np.floor((way @ across) * (np.median(depth) / depth)[:, None] / (1.5 * spacing)).astype(np.int64)
+    place = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    front = np.full(place.max() + 1, np.inf)
+    np.minimum.at(front, place, depth)
+    return float((depth > front[place] + _BEHIND * spacing).mean())
+
+
+def _visible(points: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """Indices of the points that are seen from a place: mirrored at a sphere around it, corners of their hull."""
+    way = points - eye
+    far = np.linalg.norm(way, axis=1, keepdims=True)
+    mirrored = way * (2.0 * _FLIP * far.max() / far - 1.0)
+    corners = ConvexHull(np.vstack([mirrored, np.zeros(3)])).vertices
+    return corners[corners < len(points)]
