@@ -12,6 +12,7 @@ BALL = trimesh.creation.icosphere(subdivisions=3)
 NORMALS = np.asarray(BALL.vertices)
 POINTS = 0.035 * NORMALS + [0, 0, 0.5]
 COUNT = len(POINTS)
+SHELL = POINTS[POINTS[:, 2] > 0.5] - [0, 0, 0.51]  # one side, about the origin
 
 
 @pytest.fixture
@@ -43,8 +44,8 @@ def changed(where, points=POINTS, normals=NORMALS, **more):
     [
         ({"points": np.full((COUNT, 3), np.nan)}, f"all {COUNT:,} points are NaN"),
         ({"points": POINTS[:7], "normals": NORMALS[:7]}, "7 usable points; at least 50"),
-        ({"points": POINTS - [0, 0, 0.5], "normals": None}, "give its position as --viewpoint X,Y,Z"),
-        ({"points": POINTS - [0, 0, 0.5], "normals": np.zeros((COUNT, 3))}, "give its position as --viewpoint X,Y,Z"),
+        ({"points": SHELL, "normals": None}, "give its position as --viewpoint X,Y,Z"),
+        ({"points": SHELL, "normals": np.zeros(SHELL.shape)}, "give its position as --viewpoint X,Y,Z"),
         ({"normals": NORMALS[:5]}, "normals have shape (5, 3)"),
         ({"points": 1e3 * POINTS}, "in millimetres use --scale 0.001"),
         ({"points": 1e2 * POINTS}, "in centimetres use --scale 0.01"),
