@@ -9,23 +9,20 @@ _MOST_POINTS = 20_000  # that views look at
 _VIEWS = 40
 _FAR = 3.0  # of a view from the middle, over the cloud's diagonal
 _FLIP = 100.0  # radius of the mirror of _visible, over the farthest point
-_HIDDEN_SHARE = 0.16  # of points behind others, at most, where one camera saw a cloud
-_BEHIND = 5.0  # point spacings
+_MOST_THROUGH = 0.09  # where one camera saw a cloud: 0.07 of eleven objects with 3 mm of noise
+_SPACINGS, _NOISES = 5.0, 4.0  # of a step in depth from one surface to another
 _NEIGHBOURS, _ROUNDS = 9, 10  # of what is passed on between points
 
 
 def shows_all_sides(points: np.ndarray) -> bool:
     """Whether no camera can have seen a cloud, (n, 3): from everywhere, points lie behind others."""
     points = _some(points)
-    eyes = _eyes(points)
-    spacing = _spacing(points)
-    return all(_hidden_share(points, eye, spacing) > _HIDDEN_SHARE for eye in eyes)
+    return all(_through(points, eye) > _MOST_THROUGH for eye in _eyes(points))
 
 
 def seen_from(points: np.ndarray, eye: np.ndarray) -> bool:
     """Whether a camera at a place, (3,), can have seen a cloud, (n, 3)."""
-    points = _some(points)
-    return _hidden_share(points, eye, _spacing(points)) <= _HIDDEN_SHARE
+    return _through(_some(points), eye) <= _MOST_THROUGH
 
 
 def outward(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -70,19 +67,17 @@ def _spacing(points: np.ndarray) -> float:
     return float(np.median(KDTree(points).query(points, 2)[0][:, 1]))
 
 
-def _hidden_share(points: np.ndarray, eye: np.ndarray, spacing: float) -> float:
-    """Share of points that lie behind another in the same cell of a picture."""
+def _through(points: np.ndarray, eye: np.ndarray) -> float:
+    """Share of points whose neighbour in a picture lies much nearer or farther: one surface behind another."""
     way = points - eye
     axis = way.mean(axis=0) / np.linalg.norm(way.mean(axis=0))
-    across = np.linalg.svd(axis[None])[2][1:].T
     depth = way @ axis
     if (depth <= 0.0).any():
         return 1.0  # the camera would be among the points
-    cell = np.floor((way @ across) * (np.median(depth) / depth)[:, None] / (1.5 * spacing)).astype(np.int64)
-    place = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
-    front = np.full(place.max() + 1, np.inf)
-    np.minimum.at(front, place, depth)
-    return float((depth > front[place] + _BEHIND * spacing).mean())
+    picture = (way @ np.linalg.svd(axis[None])[2][1:].T) * (np.median(depth) / depth)[:, None]
+    step = np.abs(depth - depth[KDTree(picture).query(picture, 2)[1][:, 1]])
+    noise = np.quantile(step, 0.25) / 0.45  # of depths, were their differences normally distributed
+    return float((step > max(_SPACINGS * _spacing(points), _NOISES * noise)).mean())
 
 
 def _visible(points: np.ndarray, eye: np.ndarray) -> np.ndarray:
