@@ -70,7 +70,7 @@ def _spacing(points: np.ndarray) -> float:
 def _through(points: np.ndarray, eye: np.ndarray) -> float:
     """Share of points whose neighbour in a picture lies much nearer or farther: one surface behind another."""
     way = points - eye
-    axis = way.mean(axis=0) / np.linalg.norm(way.mean(axis=0))
+    axis = way.mean(axis=0) / max(float(np.linalg.norm(way.mean(axis=0))), 1e-12)
     depth = way @ axis
     if (depth <= 0.0).any():
         return 1.0  # the camera would be among the points

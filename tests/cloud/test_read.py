@@ -75,7 +75,7 @@ def test_normals_are_estimated_and_face_the_camera(ball, name):
     assert any("estimated" in note and "camera" in note for note in cloud.notes)
 
 
-@pytest.mark.parametrize("viewpoint", [None, [0.5, 0.3, -0.2]])
+@pytest.mark.parametrize("viewpoint", [None, [0.5, 0.3, -0.2], CENTRE])
 def test_normals_of_a_cloud_from_all_sides_are_turned_outwards(ball, viewpoint):
     write, _, normals = ball
     for change in (lambda p: p, lambda p: p - CENTRE):
