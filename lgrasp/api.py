@@ -11,6 +11,7 @@ import numpy as np
 
 from lgrasp.cloud.read import Cloud
 from lgrasp.cloud.read import read_cloud as _read_cloud
+from lgrasp.cloud.suffixes import POINT_SUFFIXES
 from lgrasp.config import parse_model
 from lgrasp.dataset.files import find_shards
 from lgrasp.dataset.frame import grasp_frame
@@ -205,7 +206,7 @@ def plan(
     """
     from lgrasp.jobs.refine.plan import PlanJob
 
-    points = isinstance(object, Cloud) or Path(object).suffix.lower() in {".xyz", ".npy", ".npz"}
+    points = isinstance(object, Cloud) or Path(object).suffix.lower() in POINT_SUFFIXES
     what: dict[str, Any] = {"cloud" if points else "object": object if points else str(object)}
     what |= {} if isinstance(object, Cloud) else {"scale": scale}
     what["model"] = None if model is None else str(model)

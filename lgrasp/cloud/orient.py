@@ -17,12 +17,14 @@ _NEIGHBOURS, _ROUNDS = 9, 10  # of what is passed on between points
 def shows_all_sides(points: np.ndarray) -> bool:
     """Whether no camera can have seen a cloud, (n, 3): from everywhere, points lie behind others."""
     points = _some(points)
-    return all(_through(points, eye) > _MOST_THROUGH for eye in _eyes(points))
+    spacing = _spacing(points)
+    return all(_through(points, eye, spacing) > _MOST_THROUGH for eye in _eyes(points))
 
 
 def seen_from(points: np.ndarray, eye: np.ndarray) -> bool:
     """Whether a camera at a place, (3,), can have seen a cloud, (n, 3)."""
-    return _through(_some(points), eye) <= _MOST_THROUGH
+    points = _some(points)
+    return _through(points, eye, _spacing(points)) <= _MOST_THROUGH
 
 
 def outward(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -32,7 +34,8 @@ def outward(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     few points, as in a thin wall, it cannot tell them apart.
     """
     some = _some(points)
-    index = KDTree(some).query(points)[1]
+    tree = KDTree(some)
+    index = tree.query(points)[1]
     own = np.empty_like(some)
     own[index] = normals  # of one of the points that are nearest
     votes = np.zeros(len(some))
@@ -41,7 +44,6 @@ def outward(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         seen = _visible(some, eye)
         way = eye - middle
         votes[seen] += own[seen] @ (way / np.linalg.norm(way))
-    tree = KDTree(some)
     distance, near = tree.query(some, min(_NEIGHBOURS, len(some)))
     way = (some[near] - some[:, None]) / np.maximum(distance, 1e-12)[..., None]
     alike = np.einsum("nkd,nd->nk", own[near], own)
@@ -67,7 +69,7 @@ def _spacing(points: np.ndarray) -> float:
     return float(np.median(KDTree(points).query(points, 2)[0][:, 1]))
 
 
-def _through(points: np.ndarray, eye: np.ndarray) -> float:
+def _through(points: np.ndarray, eye: np.ndarray, spacing: float) -> float:
     """Share of points whose neighbour in a picture lies much nearer or farther: one surface behind another."""
     way = points - eye
     axis = way.mean(axis=0) / max(float(np.linalg.norm(way.mean(axis=0))), 1e-12)
@@ -77,7 +79,7 @@ def _through(points: np.ndarray, eye: np.ndarray) -> float:
     picture = (way @ np.linalg.svd(axis[None])[2][1:].T) * (np.median(depth) / depth)[:, None]
     step = np.abs(depth - depth[KDTree(picture).query(picture, 2)[1][:, 1]])
     noise = np.quantile(step, 0.25) / 0.45  # of depths, were their differences normally distributed
-    return float((step > max(_SPACINGS * _spacing(points), _NOISES * noise)).mean())
+    return float((step > max(_SPACINGS * spacing, _NOISES * noise)).mean())
 
 
 def _visible(points: np.ndarray, eye: np.ndarray) -> np.ndarray:

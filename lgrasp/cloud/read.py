@@ -204,14 +204,16 @@ def _normals(
     inside = (points.min(axis=0) <= 0.0).all() and (points.max(axis=0) >= 0.0).all()
     eye = seen_from if seen_from is not None else None if inside else np.zeros(3)
     around = (eye is None or not orient.seen_from(points, eye)) and orient.shows_all_sides(points)
-    if eye is None and not around:
+    if around:
+        eye = None
+    elif eye is None:
         raise CloudError(
             f"{path}: {share} points have no normals, and the origin lies inside the cloud, so it is no camera; "
             "give its position as --viewpoint X,Y,Z"
         )
     if missing.any():
         made = _estimated(points)
-        made = orient.outward(points, made) if around or eye is None else _facing(points, made, eye)
+        made = orient.outward(points, made) if eye is None else _facing(points, made, eye)
         normals[missing] = made[missing]
         told = "to the origin, where a camera is supposed" if seen_from is None else "to the viewpoint"
         told = "outwards: the cloud shows all sides (thin walls may be taken wrongly)" if around else told

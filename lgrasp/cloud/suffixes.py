@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-CLOUD_SUFFIXES = (".ply", ".xyz", ".npy", ".npz", ".h5")
+POINT_SUFFIXES = (".xyz", ".npy", ".npz")
+"""Of files that hold nothing but points."""
+CLOUD_SUFFIXES = (".ply", *POINT_SUFFIXES, ".h5")
 MASK_SUFFIXES = (".npy", ".npz")
 
 

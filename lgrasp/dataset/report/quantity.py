@@ -71,8 +71,8 @@ class Distribution:
             shown = good * self.quantity.factor
             self.least, self.most = min(self.least, float(shown.min())), max(self.most, float(shown.max()))
             if self.quantity.bound is not None:
-                above = shown > self.quantity.bound if strict or not self.quantity.by_friction else shown >= 0
-                self.over += int(above.sum())
+                other = self.quantity.by_friction and not strict
+                self.over += len(shown) if other else int((shown > self.quantity.bound).sum())
 
     def merge(self, other: "Distribution") -> None:
         """Take the counts of another one of the same quantity."""

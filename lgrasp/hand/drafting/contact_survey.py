@@ -22,7 +22,7 @@ _MIN_PALM_AREA = 3.0e-4  # [m^2]
 _PALM_REACH = 0.10  # [m] from the palm to what is held
 _ONE_SIDED_RATIO = 2.0  # ratio of a joint's room to both sides, for it to bend to one
 _CERTAIN_RATIO = 5.0  # of what is seen of a link's back to its front, for its joint to open where it has room
-_MAX_HINGE_COSINE = 0.6  # cosine of a hinge to the direction of what it bends, at most
+MAX_HINGE_COSINE = 0.6  # cosine of a hinge to the direction of what it bends, at most
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _palmar_axes(
     if model.tree.joint_prismatic[body - 1]:
         return m, along, None
     hinge = model.tree.joint_axis[body - 1].astype(float)
-    if abs(hinge @ along) < _MAX_HINGE_COSINE:
+    if abs(hinge @ along) < MAX_HINGE_COSINE:
         bent = np.cross(hinge, along) * _bend_sign(model.tree, body)
         if np.any(bent):
             bent /= np.linalg.norm(bent)

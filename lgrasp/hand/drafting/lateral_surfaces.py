@@ -6,7 +6,7 @@ from itertools import combinations, groupby
 
 import numpy as np
 
-from lgrasp.hand.drafting.contact_survey import ContactSurvey, pad_axis
+from lgrasp.hand.drafting.contact_survey import MAX_HINGE_COSINE, ContactSurvey, pad_axis
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures, sample_bodies
 from lgrasp.hand.spec import Surface
@@ -16,7 +16,6 @@ _PAD_ANGLE, _LATERAL_ANGLE = 60.0, 45.0  # degrees around the axis
 _LATERAL_BODIES = 3  # the last of a finger
 _MIN_NEIGHBOUR_COSINE = 0.5  # cosine of a finger's lateral axis to the way to its neighbour, at least
 _MIN_PARALLEL_COSINE = 0.7  # cosine of neighbours' directions
-_MAX_HINGE_COSINE = 0.6  # cosine of the last hinge to the finger's direction, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ def _finger(survey: ContactSurvey, model: HandModel, standing: Postures, group: 
         hinge = R @ tree.joint_axis[tip - 1].astype(float)
         along = R @ _middle(surfaces)
         axis = pad_axis(survey.model, surfaces, tip)
-        if not tree.joint_prismatic[tip - 1] and abs(hinge @ along) < _MAX_HINGE_COSINE * np.linalg.norm(along):
+        if not tree.joint_prismatic[tip - 1] and abs(hinge @ along) < MAX_HINGE_COSINE * np.linalg.norm(along):
             hinges.append(hinge)
         pads += [(s, axis) for s in surfaces if axis is not None]
         moved |= model.tree.moving_joints(model.tree.body_of(surfaces[0].link))
