@@ -135,9 +135,8 @@ class Soak:
             kept: tuple[list[str], ...] = ()
             while kept != (kept := (tree(self._warm), tree(self._kernels))):  # again if it filled the cache
                 place = self._place(name)
-                begin = time.monotonic()
-                self._finish(place)
-                self._whole[name] = place.digests(), time.monotonic() - begin
+                seconds = self._finish(place)
+                self._whole[name] = place.digests(), seconds
                 if not COMMANDS[name].cold:
                     shutil.copytree(place.cache, self._warm, dirs_exist_ok=True, copy_function=_link)
                 if folder := COMMANDS[name].gives:
@@ -207,10 +206,14 @@ class Soak:
         }
         return place
 
-    def _finish(self, place: Place) -> None:
-        code = wait(self._launch(place.arguments, place.out, place.environment, place.said), _RERUN)
+    def _finish(self, place: Place) -> float:
+        """Run a command to its end; how long it took once it was started [s]."""
+        running = self._launch(place.arguments, place.out, place.environment, place.said)
+        begin = time.monotonic()
+        code = wait(running, _RERUN)
         if code:
             raise LgraspError(f"lgrasp {' '.join(place.arguments)}: exit code {code}: {place.last_line()}")
+        return time.monotonic() - begin
 
 
 def soak(
