@@ -91,6 +91,16 @@ def test_bins_are_octahedral_and_even(coded):
     assert angle(n, centre[found]).max() < 29  # corner of the widest bin
 
 
+def test_edges_of_bins_are_far_from_axes():
+    """Fingers that bend in a plane of the base frame have such normals, and rounding must not decide on their bins."""
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    across = np.roll(axes, 1, 1)
+    for roll in np.linspace(0, 2 * np.pi, 24, endpoint=False):
+        side = np.cos(roll) * across + np.sin(roll) * np.cross(axes, across)
+        tilted = np.cos(np.radians(7.5)) * axes + np.sin(np.radians(7.5)) * side
+        np.testing.assert_array_equal(reference_bin(tilted), reference_bin(axes))
+
+
 def test_tangent_is_unit_and_orthogonal(coded):
     n, *_, t = coded
     np.testing.assert_allclose(np.linalg.norm(t, axis=1), 1, atol=1e-6)

@@ -5,6 +5,9 @@ import numpy as np
 __all__ = ["decode", "normal_bin", "octahedral"]
 
 
+_TURN = np.array([[-0.66, -0.54, 0.52], [0.69, -0.71, 0.14], [0.29, 0.45, 0.84]])
+
+
 def octahedral(n: np.ndarray) -> np.ndarray:
     """Points (k, 2) of the square [-1, 1]^2 of unit vectors n (k, 3)."""
     e = n[:, :2] / np.abs(n).sum(1, keepdims=True)
@@ -14,7 +17,7 @@ def octahedral(n: np.ndarray) -> np.ndarray:
 
 def normal_bin(n: np.ndarray, res: int = 8) -> np.ndarray:
     """Bin index (k,) of unit vectors."""
-    i = np.clip(((octahedral(n) + 1) / 2 * res).astype(int), 0, res - 1)
+    i = np.clip(((octahedral(n @ _TURN.T) + 1) / 2 * res).astype(int), 0, res - 1)
     return i[:, 0] * res + i[:, 1]
 
 
