@@ -4,9 +4,13 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 from support.field import query_field
+from support.urdfs import fingers
 
+from lgrasp.hand.drafting.import_urdf import import_urdf
+from lgrasp.object.arrays import upload_object
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.preprocess import preprocess_object
+from lgrasp.stages.context import Context
 from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.stage import run
 
@@ -27,6 +31,16 @@ def test_two_fingers_can_touch_both_anchors(context, inputs):
         assert (found[a >= 0] >= 0).all(), "an anchor is a point that its finger can touch"
         reached.append(np.where((a >= 0)[:, None], p, np.nan))
     assert (np.isfinite(np.array(reached)).all(2).sum(0) >= 2).all()
+
+
+def test_fingers_that_bend_in_one_plane_hold_flat_faces(load, tmp_path):
+    """Their normals lie in planes of the base frame, as those of a box that is put between them do."""
+    hand = import_urdf(fingers(tmp_path, 2), out=tmp_path / "hand").folder
+    inputs = load("tiny", hand=str(hand))
+    cube = upload_object(preprocess_object(trimesh.creation.box((0.05, 0.05, 0.05))), "cpu")
+    context = Context(inputs.hand, cube, inputs.field, "cpu", 0, 0)
+    table, _ = run((0, 200), PlaceParams(canonical=0, exhaustive=0, palm=0, pinch=1), context)
+    assert len(table) > 100
 
 
 def test_opposite_points_face_away_from_each_other():
