@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.errors import ShardError
@@ -29,7 +28,7 @@ class ReachJob(ReachRequest, VerdictJob):
     """Adds joints of an arm to shards, in place or to copies."""
 
     command: ClassVar[str] = "reach"
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.hand.pairs",)
 
     _arm: Arm | None = PrivateAttr(None)
@@ -72,7 +71,7 @@ class ReachJob(ReachRequest, VerdictJob):
 
         assert part.source is not None
         with ShardReader(part.source) as reader:
-            rows, objects, hand = reader.rows(), reader.objects(), reader.hand()
+            rows, objects, hand, key = reader.rows(), reader.objects(), reader.hand(), self.key_of(reader)
         begin = time.perf_counter()
         try:
             placed = placed_objects(self.at, rows, objects)
@@ -98,7 +97,7 @@ class ReachJob(ReachRequest, VerdictJob):
             "protocol": json.dumps(told),
             "statistics": {"reach_reached": int(columns["ok"].sum()), "seconds_reach": seconds},
         }
-        return Made(len(rows), added)
+        return Made(len(rows), (key, added))
 
     def _solids_with(self, hand: HandRecord) -> "ArmSolids":
         from lgrasp.reach.self_collision import ArmSolids, base_pieces
@@ -109,8 +108,8 @@ class ReachJob(ReachRequest, VerdictJob):
         return self._solids[hand.sha256]
 
     def write(self, part: Part, contents: Any) -> None:
-        assert part.source is not None
-        extend_shard(part.source, part.file, **contents)
+        key, added = contents
+        self.extend(part, key, **added)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``arm``, ``tip``, ``joints``; ``results``: of each hand and object ``rows`` and how many of them are

@@ -52,6 +52,7 @@ class ArmSearch:
         low, high = self._chain.low, self._chain.high
         drawn = torch.quasirandom.SobolEngine(len(arm.moving), scramble=True, seed=0).draw(tries).to(low)
         self._starts = low + drawn * (high - low)
+        self._slides = torch.tensor([joint.prismatic for joint in arm.moving])
         self._points = [(self._chain.frame_to_idx[link], self._put(points)) for link, points in arm.points.items()]
 
     def __call__(
@@ -113,6 +114,7 @@ class ArmSearch:
         at the pose and where the way begins."""
         T = self._put(targets.T)
         ik = self._ik(starts, _ROUGH, enforce_joint_limits=True, num_limit_refinement_iterations=_WITHIN)
+        ik.initial_config = self._near(starts, T)
         found = ik.solve(Transform3d(matrix=T))
         row, start = torch.nonzero(found.converged, as_tuple=True)
         q = at = found.solutions[row, start]
@@ -135,6 +137,15 @@ class ArmSearch:
         J = self._chain.jacobian_tensor(q)
         measure = torch.linalg.det(J @ J.mT).clamp_min(0.0).sqrt()
         return [x.cpu().numpy() for x in (row, code, torch.where(code == _REACHED, measure, -1.0), q, at)]
+
+    def _near(self, starts: torch.Tensor, T: torch.Tensor) -> torch.Tensor:
+        """The starts (S, J) for each pose (n, 4, 4), with slides moved to bring the hand there (n, S, J): limits of
+        slides may be far away."""
+        J, at = self._chain.jacobian_tensor(starts, True)
+        moves = torch.linalg.pinv(J[:, :3, self._slides], rtol=0.1)
+        q = starts.repeat(len(T), 1, 1)
+        q[..., self._slides] += ((T[:, None, :3, 3] - at[:, :3, 3])[:, :, None] @ moves.mT)[:, :, 0]
+        return q.clamp(self._chain.low, self._chain.high)
 
     def _follow(self, q: torch.Tensor, T: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Joints (n, J) for poses (n, 4, 4) near those of q (n, J), and which came there (n,)."""

@@ -87,6 +87,22 @@ def test_postures_put_the_hand_where_rows_say(job, tmp_path):
     ]
 
 
+def test_long_slides_bring_an_arm_near(job, tmp_path):
+    """An arm on a gantry reaches the poses that it takes in some posture, however far its slides go."""
+    gantry = "".join(
+        f'<link name="{a}"/><joint name="{a}" type="prismatic"><parent link="{a}"/><child link="{b}"/>'
+        f'<axis xyz="{axis}"/><limit lower="-1e5" upper="1e5"/></joint>'
+        for a, b, axis in (("room", "bridge", "1 0 0"), ("bridge", "base", "0 1 0"))
+    )
+    path = arm(tmp_path, gantry)
+    forward, limits = arm_kinematics(path)
+    limits = np.clip(0.5 * limits, -1.0, 1.0)
+    hand = forward(np.random.default_rng(4).uniform(*limits.T, (16, 9)))["flange"] @ pose_matrix(MOUNTED)
+    shard = with_poses(sample_shard(16), compose(inverse(pose_from_matrix(hand)), np.tile(PLACED, (16, 1))))
+    found = read_shard(run(job(shard, arm=path, tries=16)).paths[0]).grasps.physics
+    assert found["reach_ok"].all()
+
+
 def gaps(path, q):
     """Least distance of links that no joint joins at postures (n, 7), negative where they overlap, by Coal."""
     coal = pytest.importorskip("coal")
