@@ -3,7 +3,9 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -13,6 +15,7 @@ from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.structure import members, structure_problems, text_sha256
 from lgrasp.errors import ShardError
+from lgrasp.files import locked
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, object_set_sha256
 from lgrasp.grasp.schema import (
     CHUNK_ROWS,
@@ -37,7 +40,8 @@ def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
     """
     rows = _as_format(shard.grasps, where=path)
     columns, texts = rows.columns(), column_texts(rows)
-    with new_shard_file(path) as file:
+    # a process that is adding columns to the file that is there would put its copy in place of the new one
+    with locked(Path(path)) if os.path.isfile(path) else nullcontext(), new_shard_file(path) as file:
         write_context(file, shard)
         for name, values in columns.items():
             dataset = create_rows(file, name, values.shape, values.dtype, texts.get(name, ""))

@@ -2,12 +2,14 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import PrivateAttr
 
+from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
@@ -15,7 +17,7 @@ from lgrasp.engine.events import Part
 from lgrasp.engine.request import ShardRequest
 from lgrasp.engine.run import Job
 from lgrasp.errors import OutputError, ShardError
-from lgrasp.files import remove_leftovers
+from lgrasp.files import locked, remove_leftovers
 from lgrasp.grasp.records import Shard
 from lgrasp.grasp.schema import MADE_FROM
 
@@ -65,7 +67,27 @@ class ShardJob(ShardRequest, Job):
         """Content key of the job and of the rows of a part's source."""
         assert part.source is not None
         with ShardReader(part.source) as reader:
-            return content_key("part", 1, job=self.key(), rows=rows_digest(reader))
+            return self.key_of(reader)
+
+    def key_of(self, reader: ShardReader) -> str:
+        """Content key of the job and of the rows of an open shard."""
+        return content_key("part", 1, job=self.key(), rows=rows_digest(reader))
+
+    def extend(self, part: Part, key: str, **added: Any) -> None:
+        """Write the file of a part: its source with more columns, see :func:`extend_shard`. Of several processes that
+        add to one shard, each adds to what the others wrote.
+
+        Args:
+            key: :meth:`key_of` the rows that the columns are of.
+
+        Raises:
+            ShardError: the source has other rows by now.
+        """
+        assert part.source is not None
+        with locked(part.source) if self.in_place else nullcontext():
+            if self.part_key(part) != key:
+                raise ShardError(f"{part.source}: its rows were replaced while they were worked on; run it again")
+            extend_shard(part.source, part.file, **added)
 
     def marked(self, part: Part, shard: Shard, statistics: Mapping[str, int | float | str]) -> Shard:
         """The shard with more statistics, and what tells that it is this part of this job."""

@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shard, process_map
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.dataset.report.write import read_dataset
@@ -62,7 +61,7 @@ class MetricsJob(MetricsRequest, ShardJob):
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
         with ShardReader(part.source) as reader:
-            friction = self.numbers(stored_bounds(reader.header.config))[0].friction
+            friction, key = self.numbers(stored_bounds(reader.header.config))[0].friction, self.key_of(reader)
         workers, others = threads(self.workers), [name for name in self.add if name != HOLD]
         kinds, columns = (HOLD in self.add) + bool(others), {}
         if others:
@@ -75,11 +74,11 @@ class MetricsJob(MetricsRequest, ShardJob):
         if HOLD in self.add:
             first = part.rows * (kinds - 1)
             columns |= self._tried(part, workers, lambda done: progress((first + done) // kinds))
-        return Made(part.rows, columns)
+        return Made(part.rows, (key, columns))
 
     def write(self, part: Part, contents: Any) -> None:
-        assert part.source is not None
-        extend_shard(part.source, part.file, contents, METRIC_UNITS | METRICS)
+        key, columns = contents
+        self.extend(part, key, metrics=columns, units=METRIC_UNITS | METRICS)
 
     def close(self) -> None:
         self._open.close()

@@ -9,10 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
-from lgrasp.errors import PhysicsError
+from lgrasp.errors import PhysicsError, ShardError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.jobs.kept_verdicts import GPU_BLOCK, KeptVerdicts
@@ -70,10 +69,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         protocol, device, name = self.protocol, self.device_used.alias, self.protocol.name
         workers = threads(self.workers)
         with ShardReader(part.source) as reader:
-            scene, rows = self._scene_of(reader.hand(), reader.objects()), len(reader)
-            kept = KeptVerdicts(
-                self.cache, self.part_key(part), name, largest=GPU_BLOCK if self._kind() == "gpu" else None
-            )
+            scene, rows, key = self._scene_of(reader.hand(), reader.objects()), len(reader), self.key_of(reader)
+            kept = KeptVerdicts(self.cache, key, name, largest=GPU_BLOCK if self._kind() == "gpu" else None)
 
             before = kept.rows
 
@@ -104,15 +101,14 @@ class SimulateJob(SimulateRequest, VerdictJob):
                 f"seconds_{name}_compile": kept.compiling,
             },
         }
-        return Made(rows, (kept, added), (kept.seconds, kept.compiling))
+        return Made(rows, (kept, key, added), (kept.seconds, kept.compiling))
 
     def close(self) -> None:
         self._kept.close()
 
     def write(self, part: Part, contents: Any) -> None:
-        assert part.source is not None
-        kept, added = contents
-        extend_shard(part.source, part.file, **added)
+        kept, key, added = contents
+        self.extend(part, key, **added)
         kept.discard()
 
     def kept_of(self, part: Part) -> int:
@@ -133,6 +129,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
     def _simulated(self, path: Path, seconds: float) -> "Simulated":
         prefix = f"physics/{self.protocol.name}_"
         with ShardReader(path, invalid=False) as reader:
+            if f"{prefix}holds" not in reader.columns:
+                raise ShardError(f"{path}: it was replaced since it got its verdicts; run it again")
             hand = reader.hand()
             return Simulated(
                 path=path,

@@ -3,7 +3,9 @@
 import json
 import signal
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import h5py
@@ -13,12 +15,17 @@ from support.jaws import EDGE, Jaws
 from support.shards import write_manifest
 from support.twins import twin_rows, twin_shard
 
+from lgrasp.dataset import extend
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
+from lgrasp.engine import shard_job
+from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError
 from lgrasp.engine.listing import Renewing
+from lgrasp.engine.run import run
 from lgrasp.jobs import kept_verdicts, simulate
+from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.simulate.verdict import FREE_LIFT_COLUMNS
 from lgrasp_cli.progress import JobProgress
 
@@ -185,8 +192,8 @@ def test_killed_while_it_replaces_a_shard(cli, grasps, tmp_path, monkeypatch):
         seen.append(cli("status", grasps).out)
         raise MemoryError
 
-    extend_shard = simulate.extend_shard
-    monkeypatch.setattr(simulate, "extend_shard", die)
+    extend_shard = shard_job.extend_shard
+    monkeypatch.setattr(shard_job, "extend_shard", die)
     monkeypatch.setattr(Renewing, "close", lambda self: None)
     assert cli("simulate", grasps).code == 2
     assert len(seen) == 2
@@ -194,6 +201,40 @@ def test_killed_while_it_replaces_a_shard(cli, grasps, tmp_path, monkeypatch):
     monkeypatch.undo()
     assert cli("simulate", grasps).code == 0
     assert cli("dataset", "check", grasps).code == 0
+
+
+def test_a_shard_that_is_replaced_meanwhile(cli, grasps, tmp_path, monkeypatch):
+    """Verdicts never get to rows that they are not of."""
+    path, other = sorted(grasps.glob("*.h5"))
+    stored, judge = other.read_bytes(), simulate.verdicts
+
+    def replacing(*args, **options):
+        path.write_bytes(stored)
+        return judge(*args, **options)
+
+    monkeypatch.setattr(simulate, "verdicts", replacing)
+    assert "its rows were replaced while they were worked on; run it again" in cli("simulate", path).error()
+    assert path.read_bytes() == stored
+
+
+def test_two_processes_at_one_shard(grasps, cache_root, monkeypatch):
+    """What both add is in it; what replaces it while columns are added stays."""
+    path, other = sorted(grasps.glob("*.h5"))
+    new, adding, finish = read_shard(other), threading.Event(), extend.finish
+    monkeypatch.setattr(extend, "finish", lambda file: (adding.set(), time.sleep(0.3), finish(file)))
+
+    def simulated(name):
+        return run(SimulateRequest(shards=(path,), protocol=name).job(Cache(cache_root))).made
+
+    with ThreadPoolExecutor() as pool:
+        assert list(pool.map(simulated, ("fc", "gravity6"))) == [1, 1]
+        assert {"fc_holds", "gravity6_holds"} <= read_shard(path).grasps.physics.keys()
+        adding.clear()
+        last = pool.submit(simulated, "dipgrasp")
+        assert adding.wait(30)
+        write_shard(path, new)
+        assert last.result() == 1
+    assert len(read_shard(path).grasps) == len(new.grasps)
 
 
 def test_verdicts_so_far_are_kept(cli, grasps, tmp_path, monkeypatch, shared_cache):
