@@ -53,7 +53,8 @@ def link_contacts(
 ):
     """One thread per (run, hand): its nearest point that faces the object within the limits, if there is one.
 
-    The contact on the object is the contact point beside the foot of the perpendicular, whose normal is true.
+    The contact on the object is a contact point, whose normal is true: of those within the limits the one nearest to
+    the foot of the perpendicular.
 
     Args:
         pose: (n,) T_hand_object.
@@ -88,24 +89,21 @@ def link_contacts(
     e = sdf_gradient(obj.sdf, p)
     n = wp.vec3(e[0], e[1], e[2])
     foot = p - n * e[3]
-    beside = int(-1)
     near = float(_NORMAL_REACH)
     for k in range(obj.contacts):
         far = wp.length(obj.contact_points[k] - foot)
-        if far < near:
-            near = far
-            beside = k
-    if beside < 0:
-        return
-    m = obj.contact_normals[beside]
-    facing = -wp.dot(m, wp.transform_vector(T, runs.normals[c]))
-    if runs.grid[s] >= 0:
-        fit = contact_fit(hand, runs.grid[s], T, obj.contact_points[beside], -m)
-        best = fit[0]
-        facing = wp.min(fit[1], fit[2])
-    if wp.dot(m, n) > limits.min_spread_cosine and facing > limits.min_cosine and best < limits.max_gap:
-        found_out.gap[i, s] = best
-        found_out.surface[i, s] = beside
+        m = obj.contact_normals[k]
+        if far < near and wp.dot(m, n) > limits.min_spread_cosine:
+            gap = best
+            facing = -wp.dot(m, wp.transform_vector(T, runs.normals[c]))
+            if runs.grid[s] >= 0:
+                fit = contact_fit(hand, runs.grid[s], T, obj.contact_points[k], -m)
+                gap = fit[0]
+                facing = wp.min(fit[1], fit[2])
+            if facing > limits.min_cosine and gap < limits.max_gap:
+                near = far
+                found_out.gap[i, s] = gap
+                found_out.surface[i, s] = k
 
 
 @wp.kernel

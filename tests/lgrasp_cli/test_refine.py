@@ -45,7 +45,7 @@ def test_shards(cli, shards, tmp_path):
 
 def test_bounds_and_rows_that_fail_them(cli, shards, tmp_path):
     """With a bound that hardly any row meets, the others are left out, or kept and marked."""
-    quick = ("--matching-rounds", 1, "--set", "refine.tries=1", "--set", "bounds.max_gap=2e-4", "--device", "cpu", "-q")
+    quick = ("--matching-rounds", 1, "--set", "refine.tries=1", "--set", "bounds.max_gap=2e-5", "--device", "cpu", "-q")
     (source,) = shards.glob("*.h5")
     rows = len(read_shard(source).grasps)
     assert cli("refine", shards, "--out", tmp_path / "all", "--keep-invalid", *quick).code == 0
@@ -53,10 +53,10 @@ def test_bounds_and_rows_that_fail_them(cli, shards, tmp_path):
     assert len(after.grasps) == rows
     valid = after.grasps.metrics["valid"] == 1
     assert (~valid).sum() > 0
-    assert after.grasps.metrics["gap"][valid].max(initial=0) <= 2.1e-4
-    assert (after.grasps.metrics["gap"][after.grasps.failed_bound == "max_gap"] > 2e-4).all()
+    assert after.grasps.metrics["gap"][valid].max(initial=0) <= 2.1e-5
+    assert (after.grasps.metrics["gap"][after.grasps.failed_bound == "max_gap"] > 2e-5).all()
     assert ((after.grasps.failed_bound == "none") == valid).all()
-    assert after.header.config["bounds"]["numbers"]["max_gap"] == 2e-4
+    assert after.header.config["bounds"]["numbers"]["max_gap"] == 2e-5
     assert (
         "did you mean 'bounds.max_gap'"
         in cli("refine", shards, "--out", tmp_path / "x", "--set", "bounds.gap=1", "--device", "cpu").error()
@@ -84,6 +84,7 @@ def test_exports_of_other_programs(cli, shards, tmp_path):
     (source,) = shards.glob("*.h5")
     assert validate_shard(path) == []
     after, before = read_shard(path).grasps, read_shard(source).grasps
+    assert read_shard(path).statistics["refine_valid_before"] == len(before)  # as they were in the shard
     kept = after.metrics["refined"] == 0
     np.testing.assert_allclose(after.q[kept], before.q[kept], atol=1e-5)
     assert "--hand" in cli("refine", folder, "--from", "dexgraspnet", "--out", tmp_path / "x").error()

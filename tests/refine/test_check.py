@@ -28,6 +28,11 @@ def test_rows_of_filter_collide_with_nothing(checked, filtered):
     np.testing.assert_array_equal(table.metrics["self_penetration"], filtered.metrics["self_penetration"])
 
 
+def test_contacts_of_valid_grasps_are_found(checked):
+    """Hands that are valid with the contacts that they were made for are valid without being told of them."""
+    assert (checked[1] == Outcome.KEPT).mean() > 0.9
+
+
 def test_contacts_lie_on_the_object(checked, inputs):
     table, outcome = checked
     obj = inputs.object.model

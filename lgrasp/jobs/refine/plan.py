@@ -33,7 +33,7 @@ from lgrasp.planning.params import PlanParams, cloud_params
 from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import STAND_OFF
 
-VERSION = 10
+VERSION = 11
 """Raised whenever plans change for the same parameters."""
 
 _OBSTACLE_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way

@@ -31,7 +31,7 @@ from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
 from lgrasp.object.load import load_mesh
 from lgrasp.steer.touch import moved_rows
 
-VERSION = 4
+VERSION = 5
 """Raised whenever refined shards change for the same parameters."""
 
 
