@@ -144,13 +144,18 @@ class Manifest(_Listed):
 
         self.runs = [run.model_copy(update={"shards": list(map(renewed, run.shards))}) for run in self.runs]
 
+    def drop(self, files: Collection[str]) -> None:
+        """Forget files."""
+        runs = [r.model_copy(update={"shards": [s for s in r.shards if s.file not in files]}) for r in self.runs]
+        self.runs = [r for r in runs if r.shards]
+
     def _give(self, run: ListedRun, files: set[str]) -> None:
         """Replace a run, which takes some files from the others."""
         array = next((r.array for r in self.runs if r.run_key == run.run_key), None)
         run = run.model_copy(update={"array": run.array or array})
-        others = [r for r in self.runs if r.run_key != run.run_key]
-        others = [r.model_copy(update={"shards": [s for s in r.shards if s.file not in files]}) for r in others]
-        self.runs = [r for r in (*others, run) if r.shards]
+        self.runs = [r for r in self.runs if r.run_key != run.run_key]
+        self.drop(files)
+        self.runs += [run] if run.shards else []
 
     def text(self) -> str:
         """The file, the same for the same content."""

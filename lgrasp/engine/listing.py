@@ -24,7 +24,7 @@ from lgrasp.dataset.manifest import (
 )
 from lgrasp.engine.events import Part
 from lgrasp.errors import OutputError, ShardError
-from lgrasp.files import remove_leftovers
+from lgrasp.files import remove_leftovers, writing
 
 _MOST_LISTING = 0.05  # share of a job's time that manifests may take while it runs
 
@@ -122,6 +122,13 @@ class Listing:
             self._dirty.add(part.file.parent)
         if time.monotonic() - self._flushed > self._took / _MOST_LISTING:
             self.flush()
+
+    def remove(self, files: Sequence[Path]) -> None:
+        """Remove files of a run that is replaced, all in one folder."""
+        update_manifest(files[0].parent, partial(Manifest.drop, files={file.name for file in files}))
+        for file in files:
+            with writing(file):
+                file.unlink(missing_ok=True)
 
     def flush(self) -> None:
         """Write what is not yet in the manifests."""

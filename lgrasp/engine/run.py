@@ -29,6 +29,7 @@ from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.runtime.kernels import first_time, kernel_modules, load_kernels
 from lgrasp.runtime.ordered import in_order
+from lgrasp.words import plural
 
 
 class Job(Request, ABC):
@@ -146,6 +147,14 @@ class Job(Request, ABC):
         """How a file of another run differs from those of this job, in a few words."""
         return self.differs
 
+    def replaced(self, every: Sequence[Part]) -> list[Path]:
+        """Files of another run that has those of this one, beyond its last part."""
+        found = []
+        for path in neighbours([part.file for part in every]) if self.one_key else ():
+            with suppress(ShardError, ValueError):
+                found += [path] if found_shard(path).key != self.key() else []
+        return found
+
     def clean(self, parts: Sequence[Part]) -> None:
         """Remove leftovers of killed processes that wrote parts; files being written stay."""
         clean_folder([part.file for part in parts])
@@ -242,7 +251,7 @@ def run(
     begin = time.perf_counter()
     try:
         with _manifests(job, array, every, parts, present) as job._manifests:
-            _make_parts(job, events, outcome, job._manifests)
+            _make_parts(job, events, outcome, job._manifests, replaces=[] if resume else every)
     except CancelledError:
         outcome.cancelled = True
     finally:
@@ -318,8 +327,14 @@ def own_parts(job: Job, array: Array) -> tuple[Array, list[Part], list[Part]]:
     return array, every, array.share(every, job.part)
 
 
-def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listing | Renewing) -> None:
+def _make_parts(
+    job: Job, events: Events, outcome: JobOutcome, manifests: Listing | Renewing, *, replaces: Sequence[Part]
+) -> None:
     """Make what is missing, in order; parts are written, on other threads, while the next are made.
+
+    Args:
+        replaces: all parts of a job that replaces files; once the first is whole, what else is there of the run before
+            goes.
 
     Raises:
         CancelledError: the job was to stop; whole parts are written, those made beside an unfinished one, too.
@@ -334,6 +349,9 @@ def _make_parts(job: Job, events: Events, outcome: JobOutcome, manifests: Listin
             outcome.made_parts.append((part, made))
             events.wrote(part, made)
             made.contents = None  # memory must not grow with the parts
+            if part.number == 0 and isinstance(manifests, Listing) and (left := job.replaced(replaces)):
+                manifests.remove(left)
+                notice(f"{plural(len(left), 'more shard')} of the run before removed, first {left[0]}")
 
     def write(part: Part, made: Made) -> None:
         job.write(part, made.contents)

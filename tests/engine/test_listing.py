@@ -112,17 +112,29 @@ def test_more_and_fewer_rows_later(tmp_path):
 
 
 def test_runs_of_one_folder(tmp_path):
-    """Each has its files; a run that replaces another's takes them over as it goes."""
+    """Each has its files; of a run that is replaced none is left, and nothing goes before there is something new."""
     run(SampleJob(out=tmp_path, rows=4))
     run(SampleJob(out=tmp_path, rows=2, name="bowl"))
     assert [(r["objects"], len(r["shards"])) for r in document(tmp_path)["runs"]] == [(["bowl"], 1), (["cup"], 2)]
-    run(SampleJob(out=tmp_path, rows=2, seed=1), resume=False)
+    other = SampleJob(out=tmp_path, rows=2, seed=1)
+    run(other, StopAfter(0), resume=False)
+    assert len(list(tmp_path.glob("*.h5"))) == 3
+    run(other, resume=False)
     assert [(r["objects"], r["seed"], len(r["shards"])) for r in document(tmp_path)["runs"]] == [
         (["bowl"], 0, 1),
         (["cup"], 1, 1),
-        (["cup"], 0, 1),
     ]
-    assert differences(tmp_path) == ([], {}, [], 3)
+    assert differences(tmp_path) == ([], {}, [], 2)
+
+
+def test_tasks_that_replace_a_run_keep_what_others_made(tmp_path):
+    """The task with the first file removes what is left; files of the run itself stay, also those beyond its rows."""
+    run(SampleJob(out=tmp_path, rows=12))
+    for rows, task in ((10, 1), (6, 1), (6, 0)):
+        run(SampleJob(out=tmp_path, rows=rows, seed=1), array=(task, 2), resume=False)
+    names = [f"toy-cup-{n:05d}.h5" for n in (0, 1, 2, 3)]
+    assert sorted(path.name for path in tmp_path.glob("*.h5")) == names
+    assert differences(tmp_path) == ([], {}, [], 4)
 
 
 def test_a_run_that_finds_no_more_is_not_incomplete(tmp_path):
