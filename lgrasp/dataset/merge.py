@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.checks import row_problems
+from lgrasp.dataset.difference import NO_REASON, leaves, tell_difference
 from lgrasp.dataset.files import Paths, check_heaps, find_shards
 from lgrasp.dataset.manifest import MANIFEST, compare, read_manifest
 from lgrasp.dataset.new_shard import new_shard_file
@@ -111,8 +112,8 @@ def _survey(path: Path) -> _Source:
             index = reader.column("object_index")  # (n, o)
             starts = 0, *np.cumsum(np.bincount((index >= 0).sum(1), minlength=index.shape[1] + 1)).tolist()
         identity = {
-            "hand": (hand.name, hand.sha256[:12], *hand.joint_names),
-            "objects": [(name, sha256[:12], scale) for name, sha256, scale in reader.object_keys],
+            "hand": {"hand": hand.name, "files": hand.sha256[:12], "joints": ", ".join(hand.joint_names)},
+            "objects": {name: f"{sha256[:12]}, scale {scale}" for name, sha256, scale in reader.object_keys},
             "pipeline": header.pipeline,
             "config": dict(header.config),
             "seed": header.seed,
@@ -129,15 +130,22 @@ def _require_one_run(sources: Sequence[_Source]) -> None:
     first, holder = sources[0], dict[int, Path]()
     for source in sources:
         for what, value in source.identity.items():
-            if value != first.identity[what]:
-                mine, theirs = str(value)[:100], str(first.identity[what])[:100]
+            if value != (other := first.identity[what]):
                 rule = "merge only shards of one hand, one object set and one run"
-                raise ShardError(f"{source.path}: {what} {mine} differs from {theirs} of {first.path}; {rule}")
+                how = _difference(what, value, other)
+                raise ShardError(f"{source.path}: {what} differs from that of {first.path} ({how}); {rule}")
     for source in sources:
         for index in (part["shard_index"] for part in source.parts()):
             if index in holder:
                 raise ShardError(f"{source.path}: shard {index} is already in {holder[index]}; leave one out")
             holder[index] = source.path
+
+
+def _difference(what: str, mine: Any, other: Any) -> str:
+    """Which values differ in what must agree, and both of each."""
+    old, new = (dict(leaves(value if isinstance(value, Mapping) else {what: value})) for value in (mine, other))
+    every = sorted(old | new, key=lambda name: name in NO_REASON)
+    return tell_difference(old, new, every, sides=("here", "there"), absent=("none", "none")) or "deep inside"
 
 
 def _check_manifest(

@@ -95,20 +95,33 @@ def test_manifest(folder, tmp_path, make_shard):
     assert not (tmp_path / "x.h5").exists()
 
 
-@pytest.mark.parametrize("what", ["hand", "objects", "seed", "metrics and physics", "metric units"])
-def test_what_does_not_belong_together_is_refused(tmp_path, make_shard, what):
+@pytest.mark.parametrize(
+    ("what", "how"),
+    [
+        ("hand", "hand: other here, toy there, files: cccccccccccc here, "),
+        ("objects", "scale 0.07 here, .* there"),
+        ("config", "search.steps: 9 here, none there"),
+        ("seed", "seed: 8 here, 7 there"),
+        ("metrics and physics", r"physics/.*: none here, .* there"),
+        ("metric units", "gap: mm here, m there"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused(tmp_path, make_shard, what, how):
     a, b = make_shard(2, objects=2), make_shard(2, objects=2, shard_index=1)
     rows = b.grasps
     b = {
         "hand": replace(b, hand=replace(b.hand, name="other", sha256="c" * 64)),
         "objects": replace(b, objects=[b.objects[0], replace(b.objects[1], scale=0.07)]),
+        "config": replace(
+            b, header=replace(b.header, config={**b.header.config, "run_key": "0", "search": {"steps": 9}})
+        ),
         "seed": replace(b, header=replace(b.header, seed=8)),
         "metrics and physics": replace(b, grasps=replace(rows, physics={}, physics_protocols={})),
         "metric units": replace(b, grasps=replace(rows, metric_units={"gap": "mm"})),
     }[what]
     for name, shard in (("a.h5", a), ("b.h5", b)):
         write_shard(tmp_path / name, shard)
-    with pytest.raises(ShardError, match=rf"b\.h5: {what} .* differs from .*a\.h5; merge only shards of one hand"):
+    with pytest.raises(ShardError, match=rf"b\.h5: {what} differs from .*a\.h5 \(.*{how}.*\); merge only"):
         merge_shards(tmp_path, tmp_path / "out.h5")
 
 
