@@ -190,6 +190,18 @@ def test_bad_exports(cli, export, tmp_path, change, words):
     assert not (tmp_path / "x").exists()
 
 
+def test_an_object_in_two_scales(cli, export, tmp_path):
+    """Each scale has a shard of its own, and no row is lost; rows of another scale are other rows."""
+    folder = export(lambda entries: [e | {"scale": 1.0 + 0.1 * (k < 3)} for k, e in enumerate(entries)])
+    quick = ("--matching-rounds", 1, "--set", "refine.tries=1", "--keep-invalid", "--device", "cpu", "-q")
+    refine = ("refine", folder, "--from", "dexgraspnet", "--hand", "allegro", *quick, "--out", tmp_path / "x")
+    assert cli(*refine).code == 0
+    shards = [read_shard(path) for path in sorted((tmp_path / "x").glob("allegro-tiny-*.h5"))]
+    assert [(s.objects[0].scale, len(s.grasps), s.header.shard_index) for s in shards] == [(1.1, 3, 0), (1.0, 5, 1)]
+    export(lambda entries: [e | {"scale": 1.2 - 0.2 * (k >= 3)} for k, e in enumerate(entries)])
+    assert "--overwrite" in cli(*refine).error()
+
+
 def test_exports_of_another_hand_or_without_a_mesh(cli, export, tmp_path):
     base = [export(), "--from", "dexgraspnet", "--device", "cpu", "--out", tmp_path / "x", "--hand"]
     assert "entry 0: lacks joint 'finger_1_med_joint'" in cli("refine", *base, "barrett").error()

@@ -1,6 +1,7 @@
 """The job of ``lgrasp refine``: shards, or grasps of other formats, moved by a local search and written again."""
 
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -66,24 +67,28 @@ class RefineJob(RefineRequest, ShardJob):
             )
 
     def _parts_of_export(self, form: str) -> list[Part]:
-        """Grasps in the format of another program: a part of each object."""
+        """Grasps in the format of another program: a part of each object and scale, those of one name numbered."""
         assert self.hand is not None
         source, model = named_hand(self.cache, self.hand, self.device_used)
         self._models[model.sha256] = upload_hand(model, self.device_used.alias)
         self._given = dict(enumerate(_grasp_shards(self.shards[0], form, source, model)))
         self._hands, self._objects = {model.name}, {shard.objects[0].id for shard in self._given.values()}
-        files = [shard_path(self.folder, model.name, shard.objects[0].id, 0) for shard in self._given.values()]
-        return [
-            Part(number, file, len(shard.grasps), self.shards[0], 0)
-            for (number, shard), file in zip(self._given.items(), files, strict=True)
-        ]
+        parts, named = [], Counter[Path]()
+        for number, shard in self._given.items():
+            hand, code = model.name, shard.objects[0].id
+            first = shard_path(self.folder, hand, code, 0)
+            file = shard_path(self.folder, hand, code, named[first])
+            parts.append(Part(number, file, len(shard.grasps), self.shards[0], named[first]))
+            named[first] += 1
+        return parts
 
     def part_key(self, part: Part) -> str:
         if self.form is None:
             return super().part_key(part)
-        rows = self._given[part.number].grasps
-        digest = [np.asarray(values).tobytes().hex() for values in (rows.q, rows.object_pose)]
-        return content_key("part", 1, job=self.key(), rows=digest)
+        shard = self._given[part.number]
+        digest = [np.asarray(values).tobytes().hex() for values in (shard.grasps.q, shard.grasps.object_pose)]
+        of = [shard.hand.sha256, shard.objects[0].sha256, shard.objects[0].scale]
+        return content_key("part", 2, job=self.key(), of=of, rows=digest)
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
@@ -132,7 +137,8 @@ class RefineJob(RefineRequest, ShardJob):
         config = {**shard.header.config, "bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
         if told := config.pop("steered", None):
             config |= moved_rows(told)
-        header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__)
+        index = part.shard_index
+        header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__, shard_index=index)
         # contacts are found anew, wherever they are
         objects = [replace(record, regions=None, touch_share=1.0) for record in shard.objects]
         refined = replace(shard, header=header, objects=objects, grasps=moved.rows)
@@ -201,7 +207,7 @@ def _check_rows(path: Path, shard: Shard) -> None:
 
 
 def _grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) -> Iterator[Shard]:
-    """Grasps in the format of another program as one shard an object; joints go by their names.
+    """Grasps in the format of another program as one shard an object and scale; joints go by their names.
 
     Raises:
         ConfigError: an unknown format.
