@@ -174,7 +174,6 @@ def check_hand(
     ]
     columns = ("object", *stages, "grasps", "seconds")
     blocks = [
-        *([found.note] if found.note else ()),
         *(f"note: {note}" for note in found.notes),
         TextTable(columns, rated, right=columns[1:]),
         *(f"{o.name}: {line}" for o in found.objects for line in o.reasons),

@@ -49,10 +49,9 @@ def build_field(
 
     with Bar() as bar:
         data = prepare_field(cache, hand, params, index=index, device=device, report=bar.share)
-    note = f"; {data['note']}" if data["note"] else ""
     clear = "  ".join(number(share, ".0%") for share in data["clear_share"])
     pairs = [
-        ("hand", f"{data['hand']}: {data['groups']} fingers, {data['joints']} joints{note}"),
+        ("hand", f"{data['hand']}: {data['groups']} fingers, {data['joints']} joints"),
         ("patches", f"{data['patches']:,}"),
         ("contact vectors", f"{data['vectors']:,}"),
         ("index", f"{data['index']}: {data['voxels']:,} voxels of {data['cell'] * 1000:.1f} mm"),

@@ -4,13 +4,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from lgrasp.errors import HandError
-from lgrasp.hand.names import hand_path, known_hands
+from lgrasp.hand.names import hand_path, known_hands, name_of_file
 from lgrasp.hand.spec import Coupling, HandSpec, load_spec
 from lgrasp.hand.spec_check import space_problem
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
+from lgrasp.notices import notice
 from lgrasp.paths import name_problem
+
+_SAME_SHAPE = 0.01  # [m] that joints of hands of one shape are apart at most
 
 
 @dataclass(frozen=True)
@@ -21,6 +26,8 @@ class HandSource:
     urdf: Path
     spec: HandSpec
     note: str = ""
+    known: str = ""
+    """The known hand of this shape whose rules a file has."""
 
     def __post_init__(self) -> None:
         if problem := name_problem(self.name):
@@ -36,7 +43,7 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
     ``DISTRIBUTION:URDF``).
 
     For a URDF the rules are those of the hand.yaml beside it, else those of the known hand whose joint and link names
-    all occur in it.
+    all occur in it. One line tells of rules that are not the hand's own.
 
     Args:
         draft: makes the rules of a package's URDF that no known hand fits.
@@ -48,13 +55,15 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
     if path.is_dir():
         return _from_folder(path)
     if path != Path(name).expanduser():
-        return _from_package(path, name.replace(":", "_"), draft)
-    source = _from_folder(path.parent, path) if (path.parent / "hand.yaml").is_file() else rules_of_known(path)
-    if source is None:
+        source = _from_package(path, name.replace(":", "_"), draft)
+    elif (path.parent / "hand.yaml").is_file():
+        source = _from_folder(path.parent, path)
+    elif (source := rules_of_known(path)) is None:
         raise HandError(
             f"URDF {path}: no hand.yaml beside it and no known hand has its joint and link names; draft one with "
             f"'lgrasp hands add {path}' (known hands: {', '.join(known_hands())})"
         )
+    notice(source.note and f"hand '{name}': {source.note}")
     return source
 
 
@@ -64,7 +73,7 @@ def _from_folder(folder: Path, urdf: Path | None = None, note: str = "") -> Hand
 
 
 def rules_of_known(path: Path) -> HandSource | None:
-    """The URDF with the rules of the known hand whose joint and link names all occur in it."""
+    """The URDF, called as its file, with the rules of the known hand whose joint and link names all occur in it."""
     urdf = read_urdf(path)
     movable = {j.name: j for j in urdf.joints if j.movable}
     for folder in known_hands().values():
@@ -77,15 +86,27 @@ def rules_of_known(path: Path) -> HandSource | None:
             stated = {name for name, joint in movable.items() if joint.mimic is not None}
             mimic = {j.name: j.mimic for j in own.joints if j.mimic is not None and j.name not in stated}
             missing = {n: Coupling(joint=j, multiplier=m, offset=b) for n, (j, m, b) in mimic.items()}
-            note = f"rules of the known hand '{source.name}' (same joint and link names)"
+            note = f"rules (contacts, canonical box, open posture) of the known hand '{source.name}', whose joints and "
+            note += "links have the same names"
             if missing:
                 note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
+            away, name = _joints_away(urdf, own), name_of_file(path, urdf.name)
+            if away > _SAME_SHAPE:
+                note += (
+                    f"; but joints are up to {1e3 * away:.0f} mm elsewhere: 'lgrasp hands add' drafts rules for them"
+                )
             added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
             spec, left_out = _without_misfits(
-                urdf, source.spec.model_copy(update={"mimic": added | missing, "approximation": ""})
+                urdf, source.spec.model_copy(update={"mimic": added | missing, "approximation": "", "name": name})
             )
-            return HandSource(source.name, path, spec, note + left_out)
+            return HandSource(name, path, spec, note + left_out, source.name if away <= _SAME_SHAPE else "")
     return None
+
+
+def _joints_away(urdf: Urdf, known: Urdf) -> float:
+    """How far a joint is at most from where a known hand has it on its parent link [m]."""
+    at = {j.name: j.T_parent_joint[:3, 3] for j in known.joints}
+    return max(float(np.linalg.norm(j.T_parent_joint[:3, 3] - at[j.name])) for j in urdf.joints if j.movable)
 
 
 def _without_misfits(urdf: Urdf, spec: HandSpec) -> tuple[HandSpec, str]:

@@ -1,5 +1,6 @@
 """Names of hands, and the folders or files that they stand for; what is there is looked up, nothing is read."""
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +38,19 @@ PACKAGE_HANDS = {
     "robotiq_2f_85": PackageHand("pybullet-grasper", "robotiq_2f_85", "Robotiq 2F-85, gripper"),
 }
 """Short name -> hand of a package; any other is DISTRIBUTION:URDF."""
+
+
+_UNINFORMATIVE_NAMES = {"hand", "robot", "model", "urdf", "gripper"}
+
+
+def slug(text: str) -> str:
+    """A text as a name of letters, digits, '.', '_' and '-'."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._-") or "hand"
+
+
+def name_of_file(file: Path, robot: str) -> str:
+    """What the hand of a file is called: as the file, or as the robot in it when the file is hand.urdf or the like."""
+    return slug(file.stem if file.stem.lower() not in _UNINFORMATIVE_NAMES else robot)
 
 
 def pip_line(distribution: str) -> str:

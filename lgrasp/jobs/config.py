@@ -27,7 +27,7 @@ from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.request import Request, named
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
-from lgrasp.hand.names import all_hands, hand_path
+from lgrasp.hand.names import all_hands, known_hands
 from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest
 from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
 from lgrasp.notices import notice
@@ -219,8 +219,8 @@ def pair_requests(
         request = parse_model(GenerateRequest, what | shared, "generate")
         if other := found.get(out):
             raise ConfigError(
-                f"{other.hand} with {other.object} and {hand} with {mesh} have one folder, {out}; rename a file, or "
-                "generate one of them alone with --out"
+                f"{other.hand} with {other.object} and {hand} with {mesh} have one folder, {out}; name one otherwise: "
+                "rename its file, or change 'name' in its hand.yaml"
             )
         found[out] = request
     return list(found.values())
@@ -241,7 +241,7 @@ def hand_name(hand: str) -> str:
     Raises:
         HandError: there is no such hand.
     """
-    if hand_path(hand).name == hand:  # one of the catalogue is called by its folder
+    if hand in known_hands():  # one of the catalogue is called by its folder
         return hand
     from lgrasp.jobs.hands import hand_source  # slow to load
 

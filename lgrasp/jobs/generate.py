@@ -235,7 +235,7 @@ class GenerateJob(GenerateRequest, SearchJob):
         stage, words = starving_stage(counts)
         if stage in ("search", "hold") and self.pipeline.bounds.max_unresisted_load < _LOOSE_LOAD:
             words += f"; grasps that resist less: --set bounds.max_unresisted_load={_LOOSE_LOAD}, or --pipeline swift"
-        untried = self.pipeline.params("place").policy is None and own_policy(self.pipeline, self.keys.source.name)
+        untried = self.pipeline.params("place").policy is None and own_policy(self.pipeline, self.keys.source)
         if stage in ("search", "hold") and untried:
             words += f"; likelier poses: --set place.policy={SHIPPED}"
         return StarvedError(f"{few}; stage {stage} is the bottleneck: {words}")

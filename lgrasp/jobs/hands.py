@@ -45,7 +45,7 @@ def _looked_up(pipeline: Pipeline, hand: str) -> Pipeline:
         return pipeline
     source = hand_source(hand)
     if policy == SHIPPED:
-        shipped = own_policy(pipeline, source.name)
+        shipped = own_policy(pipeline, source)
         pipeline = pipeline.with_params("place", policy=str(shipped) if shipped else None)
     if not looked_up and policy in (None, SHIPPED):
         return pipeline
@@ -61,11 +61,12 @@ def _looked_up(pipeline: Pipeline, hand: str) -> Pipeline:
     return pipeline.model_copy(update={"steer": steer, "hand": pipeline.hand.model_copy(update=asked)})
 
 
-def own_policy(pipeline: Pipeline, hand: str) -> Path | None:
-    """The pose policy that is shipped with a hand, for pipelines that ask for nothing and have nothing in the way."""
+def own_policy(pipeline: Pipeline, hand: HandSource) -> Path | None:
+    """The pose policy that is shipped with a hand, or with the known one that a file is of, for pipelines that ask for
+    nothing and have nothing in the way."""
     if pipeline.steer.asks or pipeline.on_table:
         return None
-    return shipped_policy(hand, pipeline.hand.contact_links)
+    return shipped_policy(hand.known or hand.name, pipeline.hand.contact_links)
 
 
 def _suited(pipeline: Pipeline, hand: str) -> Pipeline:

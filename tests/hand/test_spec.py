@@ -164,8 +164,14 @@ def test_urdf_with_the_names_of_a_known_hand(tmp_path):
     shutil.copy(SHIPPED / "hand.urdf", path)
     source = find_hand(str(path))
     assert source.urdf == path
-    assert source.spec.name == "allegro"
+    assert source.name == source.spec.name == "my_copy"
+    assert source.known == "allegro"
     assert "known hand 'allegro'" in source.note
+    assert "elsewhere" not in source.note
+    path.write_text(path.read_text().replace('xyz="0 0 0.054"', 'xyz="0 0 0.084"'))
+    source = find_hand(str(path))
+    assert source.known == ""
+    assert "joints are up to 30 mm elsewhere" in source.note
 
 
 @pytest.mark.skipif(
@@ -181,7 +187,7 @@ def test_broken_neighbour_does_not_hide_a_known_hand(library):
     (library / "hand.urdf").write_text("broken")
     path = library.parent / "other.urdf"
     shutil.copy(SHIPPED / "hand.urdf", path)
-    assert find_hand(str(path)).spec.name == "allegro"
+    assert find_hand(str(path)).known == "allegro"
 
 
 def test_unknown_hands(library, tmp_path):

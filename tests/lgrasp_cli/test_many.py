@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from lgrasp.hand.find import find_hand
 from lgrasp.object.find import find_object
 
 
@@ -34,6 +35,17 @@ def test_a_job_for_every_object(cli, meshes, quick, tmp_path):
     assert json.loads(alone.out)["present"] == 4
     info = cli("dataset", "info", "grasps", "--json", "-")
     assert sum(shard["rows"] for shard in json.loads(info.out)) == 12
+
+
+def test_revisions_of_a_known_hand_are_called_as_their_files(cli, quick, tmp_path):
+    for name in ("rev_a", "rev_b"):
+        shutil.copy(find_hand("allegro").urdf, tmp_path / f"{name}.urdf")
+    both = ("--hand", "rev_a.urdf", "--hand", "rev_b.urdf")
+    plan = cli("generate", "-p", quick, "-n", 4, "--device", "cpu", "--object", "tiny", *both, "--dry-run")
+    assert plan.code == 0, plan
+    for name in ("rev_a", "rev_b"):
+        assert f"grasps/{name}-tiny/quick" in plan.out
+        assert plan.err.count(f"hand '{name}.urdf': rules (contacts, canonical box, open posture) of the known") == 1
 
 
 def test_what_holds_nothing(cli, tmp_path):

@@ -26,11 +26,11 @@ from lgrasp.hand.drafting.mjcf import mjcf_to_urdf
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, thin_mesh
+from lgrasp.hand.names import name_of_file, slug
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
 from lgrasp.hand.urdf import check_robot, find_mesh, is_mjcf, read_robot
 from lgrasp.paths import cache_dir, user_dir
 
-_UNINFORMATIVE_NAMES = {"hand", "robot", "model", "urdf", "gripper"}
 _DRAFT_VERSION = 4
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
@@ -74,10 +74,10 @@ def import_urdf(
         if root is not None:
             cut_hand(urdf, robot, root)
         source = check_robot(urdf, robot, raw, mesh_dirs)
-        name = name or _slug(root or (file.stem if file.stem.lower() not in _UNINFORMATIVE_NAMES else source.name))
-        if name != _slug(name):
+        name = name or (slug(root) if root else name_of_file(file, source.name))
+        if name != slug(name):
             raise HandError(
-                f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{_slug(name)}'"
+                f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{slug(name)}'"
             )
         folder = Path(out).expanduser() if out is not None else user_dir("hands") / name
         if os.path.lexists(folder) and not force:
@@ -124,10 +124,6 @@ def _as_urdf(file: Path, root: str | None, mesh_dirs: Sequence[Path]) -> Iterato
         except LgraspError as error:
             text = str(error).replace(f"URDF {urdf}", f"MJCF {file}").replace(str(urdf), str(file))
             raise type(error)(text.replace(f"{folder}/", "")) from None
-
-
-def _slug(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._-") or "hand"
 
 
 def _fill(
@@ -212,7 +208,7 @@ def _take_meshes(robot: etree._Element, folder: Path, find: FindMesh, originals:
 
 def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: list[str]) -> str:
     """Path, relative to the folder, of the copy of a mesh."""
-    base = f"meshes/{kind}/{_slug(file.stem)}"
+    base = f"meshes/{kind}/{slug(file.stem)}"
     whole = _rewritten(file, huge=kind == "collision")
     suffix = file.suffix.lower() if whole is None else ".stl"
     numbered = (f"{base}_{number}{suffix}" for number in itertools.count(2))
