@@ -285,10 +285,21 @@ class _Writer:
         m, found = self._m, []
         if m.jnt_actfrclimited[j]:
             found.append(np.abs(m.jnt_actfrcrange[j]).max())
-        for i in np.flatnonzero(m.actuator_forcelimited).tolist():
-            if self._drives_joint(i) and m.actuator_trnid[i, 0] == j:
-                found.append(np.abs(m.actuator_forcerange[i]).max() * abs(m.actuator_gear[i, 0]))
+        for i in range(m.nu):
+            if self._drives_joint(i) and m.actuator_trnid[i, 0] == j and (force := self._force(i)) is not None:
+                found.append(force * abs(m.actuator_gear[i, 0]))
         return float(min(found)) if found else None
+
+    def _force(self, i: int) -> float | None:
+        """Largest force of an actuator before its gear; None: not limited."""
+        m, lib, found = self._m, self._lib, []
+        if m.actuator_forcelimited[i]:
+            found.append(np.abs(m.actuator_forcerange[i]).max())
+        kind = m.actuator_dyntype[i], m.actuator_gaintype[i], m.actuator_biastype[i]
+        motor = kind == (int(lib.mjtDyn.mjDYN_NONE), int(lib.mjtGain.mjGAIN_FIXED), int(lib.mjtBias.mjBIAS_NONE))
+        if motor and m.actuator_ctrllimited[i]:
+            found.append(abs(m.actuator_gainprm[i, 0]) * np.abs(m.actuator_ctrlrange[i]).max())
+        return min(found, default=None)
 
     def _note_drives(self) -> None:
         """Note joints that the file does not say enough of: how tendons share them, what drives them."""

@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from lxml import etree
 
 from lgrasp.errors import HandError, PhysicsError
 from lgrasp.hand.drafting.import_urdf import import_urdf
@@ -66,7 +67,8 @@ HAND = """
     <joint joint1="turn" joint2="bend" polycoef="0 1 1 0 0" active="false"/>
   </equality>
   <actuator>
-    <motor joint="bend" gear="3" forcerange="-2 1"/><position joint="slide" kp="5"/><motor tendon="shared"/>
+    <motor joint="bend" gear="3" ctrlrange="-1.5 1"/>
+    <position joint="slide" kp="5" ctrlrange="0 .01" forcerange="-2 1"/><motor tendon="shared"/>
   </actuator>
 </mujoco>
 """
@@ -128,7 +130,9 @@ def test_limits_and_torques_are_those_of_the_file(made):
     for joint in urdf.joints:
         if joint.movable and joint.name != "turn":
             assert (joint.lower, joint.upper) == pytest.approx(tuple(model.joint(joint.name).range), abs=1e-12)
-    assert 'effort="6.0"' in urdf.text  # gear times the larger force
+    limits = etree.fromstring(urdf.text.encode()).iterfind("joint/limit")
+    efforts = {limit.getparent().get("name"): limit.get("effort") for limit in limits if limit.get("effort")}
+    assert efforts == {"bend": "4.5", "slide": "2.0"}  # gear times the larger force or control
 
 
 def test_geometry_and_masses_are_those_of_the_file(made):
