@@ -151,12 +151,16 @@ def test_a_mesh_of_several_files_is_taken_along(tmp_path):
     assert build_hand(made.folder / "hand.urdf", made.spec, pieces_only=True).groups == 2
 
 
-def test_couplings_that_another_urdf_of_the_hand_has_are_told(tmp_path):
+def test_couplings_that_another_urdf_of_the_hand_has_are_told(tmp_path, monkeypatch):
     (tmp_path / "coupled.urdf").write_bytes(gripper(tmp_path, mimic=True).read_bytes())
     (tmp_path / "broken.urdf").write_text("<robot>")
     made = import_urdf(gripper(tmp_path), out=tmp_path / "made")
-    (line,) = [line for line in made.decisions if "<mimic>" in line]
-    assert re.match(r"note: this URDF has no <mimic> for r, which \S*coupled.urdf has", line)
-    (tmp_path / "coupled.urdf").unlink()
+    (line,) = [line for line in made.decisions if "couple" in line]
+    assert re.match(r"note: this file does not couple r, which \S*coupled.urdf does", line)
+    # a hand of the user's own is no evidence
+    (tmp_path / "hands" / "mine").mkdir(parents=True)
+    (tmp_path / "coupled.urdf").rename(tmp_path / "hands" / "mine" / "hand.urdf")
+    (tmp_path / "hands" / "mine" / "hand.yaml").touch()
+    monkeypatch.setenv("LGRASP_PATH", str(tmp_path))
     again = import_urdf(gripper(tmp_path), out=tmp_path / "again")
-    assert not any("<mimic>" in line for line in again.decisions)
+    assert not any("couple" in line for line in again.decisions)
