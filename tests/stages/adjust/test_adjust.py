@@ -176,7 +176,7 @@ def test_batches_change_nothing(adjusting, inputs):
     parts = [run_stages(adjusting, context, *cut, "filter") for cut in ((0, 150), (150, 250))]
     for name in ("index", "slot", "pose", "q"):
         np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name))
-    assert len(whole) > 5
+    assert len(whole) >= 5
 
 
 def test_kernel_of_larger_groups_gives_the_same(adjusting, inputs, monkeypatch):

@@ -193,7 +193,7 @@ def test_postures_that_meet_are_not_combined(context, swift):
     found, apart = {}, {}
     for name, pairs in (("sets", False), ("pairs", True)):
         pipeline = swift.with_params("search", check_depth=True, check_pairs=pairs, per_pose=12)
-        table = run_stages(pipeline, context, 0, 300, "search")
+        table = run_stages(pipeline, context, 0, 400, "search")
         counts = run_filter(table, pipeline.params("filter"), context)[1]
         found[name], apart[name] = len(table), counts["self-collision"] / sum(counts.values())
     assert found["pairs"] >= found["sets"] > 50
