@@ -4,7 +4,7 @@ from pathlib import Path, PurePosixPath
 
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord
-from lgrasp.hand.urdf import parse_robot
+from lgrasp.hand.urdf import mesh_place, parse_robot
 
 
 def write_hand(record: HandRecord, folder: Path) -> Path:
@@ -25,7 +25,7 @@ def write_hand(record: HandRecord, folder: Path) -> Path:
     urdf.parent.mkdir()
     urdf.write_bytes(record.urdf.encode())
     for name, data in record.meshes.items():
-        file = (urdf.parent / name.removeprefix("package://").removeprefix("file://").lstrip("/")).resolve()
+        file = (urdf.parent / mesh_place(name)[0].lstrip("/")).resolve()
         if not file.is_relative_to(folder.resolve()):
             raise ShardError(f"hand '{record.name}': mesh '{name}' is named outside the hand's folder")
         file.parent.mkdir(parents=True, exist_ok=True)

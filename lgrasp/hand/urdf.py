@@ -2,10 +2,12 @@
 
 import math
 import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 from lxml import etree
@@ -264,8 +266,17 @@ def _geometry(
     return Geometry(kind, size, origin)
 
 
+def mesh_place(name: str) -> tuple[str, bool]:
+    """Path of a mesh by its name in a URDF, and whether it begins with the name of a package: ``package://``,
+    ``model://`` and ``$(find NAME)/`` do."""
+    scheme, _, rest = name.rpartition("://")
+    rest = unquote(rest).replace("\0", "") if scheme else name
+    place, found = re.subn(r"^\$\(find +([^)]*)\)", r"\1", rest)
+    return place, scheme in ("package", "model") or found > 0
+
+
 def find_mesh(path: Path, link: str, name: str, mesh_dirs: Sequence[Path] = ()) -> Path:
-    """File of a mesh that a link of the URDF at ``path`` names; ``package://`` is a folder beside or above the URDF.
+    """File of a mesh that a link of the URDF at ``path`` names; a package is a folder beside or above the URDF.
 
     Args:
         mesh_dirs: folders in which a mesh is looked for that is not there, by as many of the last parts of its name as
@@ -275,22 +286,22 @@ def find_mesh(path: Path, link: str, name: str, mesh_dirs: Sequence[Path] = ()) 
         HandError: no such file, or one outside the hand's folder tree and the given folders, symbolic links followed.
     """
     folder = path.resolve().parent
-    if name.startswith("package://"):
+    rest, of_package = mesh_place(name)
+    if of_package:
         # a package is a folder beside or above the URDF (never the root); its name may be that folder's
-        rest = name.removeprefix("package://")
         inner = rest.split("/", 1)[-1]
         bases = [folder, *[p for p in folder.parents if p != p.parent][:3]]
         trials = [base / part for base in bases for part in (rest, inner)]
         allowed = bases[-1]
     else:
-        trials = [folder / name.removeprefix("file://")]
+        trials = [folder / rest, folder / rest.lstrip("/")]  # the last: a mesh of a shard's hand
         # meshes often sit beside the folder of the URDF (../meshes): one level up is the hand's own package
         allowed = folder.parent
     for trial in trials:
         file = trial.resolve()
         if file.is_relative_to(allowed) and os.path.isfile(file):  # False, not an error, for impossible names
             return file
-    parts = [part for part in name.removeprefix("package://").removeprefix("file://").split("/") if part.strip(".")]
+    parts = [part for part in rest.split("/") if part.strip(".")]
     for first in range(max(0, len(parts) - _MOST_PARTS), len(parts)):
         for other in (folder.resolve() for folder in mesh_dirs):
             file = other.joinpath(*parts[first:]).resolve()

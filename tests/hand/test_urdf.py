@@ -1,13 +1,16 @@
 """Bad URDFs: one line that names the file and what is accepted; never a traceback, never another file's content."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from support.shards import sample_hand
 
 from lgrasp.errors import HandError
+from lgrasp.grasp.hand_files import write_hand
 from lgrasp.hand.urdf import read_urdf
 
 SHAPE = '<collision><geometry><box size="0.02 0.02 0.06"/></geometry></collision>'
@@ -107,6 +110,7 @@ BAD = {
     "mesh by address": (robot(link("a", mesh("file:///etc/passwd")), B, J), "outside the hand's folder"),
     "mesh in a package above": (robot(link("a", mesh("package://../../../etc/passwd")), B, J), "outside|not exist"),
     "mesh in package etc": (robot(link("a", mesh("package://etc/passwd")), B, J), "does not exist"),
+    "mesh by encoded address": (robot(link("a", mesh("file://%2e%2e/%2e%2e/%2e%2e/%00x")), B, J), "outside the hand's"),
     "mesh name too long": (robot(link("a", mesh(3000 * "x")), B, J), "does not exist"),
     "mesh without size": (robot(link("a", mesh("m.stl", ' scale="0 1 1"')), B, J), "other than 0"),
     "origin not finite": (robot(A, B, J.replace("<axis", '<origin xyz="0 0 inf"/><axis')), "not finite|malformed"),
@@ -164,16 +168,27 @@ def test_symlink_out_of_the_folder_is_refused(tmp_path):
     assert_refused(path, "x.stl")
 
 
-@pytest.mark.parametrize("name", ["box.stl", "package://hand/box.stl", "package://box.stl", "../meshes/box.stl"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("box.stl", "../meshes/box.stl", "file://{}/b%6fx.stl", "package://hand/box.stl", "package://box.stl"),
+        *("model://hand/box.stl", "$(find hand)/box.stl", "file://$(find hand)/box.stl"),
+    ],
+)
 def test_mesh_is_found(name, tmp_path):
+    """Beside a URDF, and where the hand of a shard is written."""
     folder = tmp_path / "pack" / "hand"
+    name = name.format(folder)
     for place in (folder, tmp_path / "pack" / "meshes"):
         place.mkdir(parents=True)
         trimesh.creation.box((0.1, 0.1, 0.1)).export(place / "box.stl")
     path = folder / "hand.urdf"
     path.write_text(robot(link("a", mesh(name, ' scale="0.5 0.5 0.5"')), B, J))
     urdf = read_urdf(path)
-    assert urdf.mesh_files[name].is_file()
+    data = urdf.mesh_files[name].read_bytes()
+    (tmp_path / "shard").mkdir()
+    again = write_hand(replace(sample_hand(), urdf=urdf.text, meshes={name: data}), tmp_path / "shard")
+    assert read_urdf(again).mesh_files[name].read_bytes() == data
     assert urdf.links["a"][0].size == (0.5, 0.5, 0.5)
 
 
