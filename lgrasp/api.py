@@ -1,9 +1,11 @@
 """The functions of ``import lgrasp as lg``: hand and object in, grasps in memory out; no file without ``out``."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from numbers import Real
+from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +23,7 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.run import Job, run
-from lgrasp.errors import ConfigError, StarvedError
+from lgrasp.errors import ConfigError, LgraspError, ShardError, StarvedError
 from lgrasp.files import temporary_folder
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
 from lgrasp.hand.model import HandModel
@@ -33,7 +35,10 @@ from lgrasp.simulate.protocol import Protocol, find_protocol
 
 if TYPE_CHECKING:
     import pandas as pd
+    import torch
     from PIL.Image import Image
+
+    DeviceName = str | torch.device
 
 Name = str | Path
 Hand = HandModel
@@ -69,7 +74,10 @@ class Grasps(GraspRows):
         Raises:
             LgraspError: it cannot be written, or the rows do not conform.
         """
-        write_shard(path, self.shard)
+        try:
+            write_shard(path, self.shard)
+        except ShardError as error:  # of the rows, wherever they are to be written
+            raise ShardError(str(error).removeprefix(f"cannot write {path}: ")) from None
         return Path(path)
 
     def to_pandas(self) -> "pd.DataFrame":
@@ -106,7 +114,8 @@ class Grasps(GraspRows):
     def __getitem__(self, rows: slice | np.ndarray | Sequence[int]) -> "Grasps":
         if self.sequence is not None:
             raise ConfigError("rows of sequences extend other rows of their file; take what you need from the columns")
-        chosen = np.arange(len(self))[rows if isinstance(rows, slice) else np.asarray(rows)].reshape(-1)
+        at = rows if isinstance(rows, slice) else np.asarray(rows, None if np.size(rows) else int)  # [] would be float
+        chosen = np.arange(len(self))[at].reshape(-1)
         changed: dict[str, Any] = {}
         for name, values in self.columns().items():
             group, slash, member = name.partition("/")
@@ -129,7 +138,7 @@ def generate(
     seed: int | None = None,
     scale: float = 1.0,
     negatives: float = 0.0,
-    device: str = "auto",
+    device: "DeviceName" = "auto",
     workers: int = 0,
     out: Name | None = None,
 ) -> Grasps:
@@ -152,7 +161,7 @@ def generate(
 
     what = _asked(hand, n, pipeline, seed, device, workers, out)
     what["pipeline"] = what["pipeline"].with_steering(**(steer or {}))
-    return _done(GenerateJob, out, n, object=str(object), scale=scale, negatives=negatives, **what)
+    return _done(GenerateJob, out, n, object=_named(object, "object"), scale=scale, negatives=negatives, **what)
 
 
 def sequence(
@@ -163,7 +172,7 @@ def sequence(
     pipeline: Name | Pipeline = "sequence",
     seed: int | None = None,
     scale: str | float = 1.0,
-    device: str = "auto",
+    device: "DeviceName" = "auto",
     workers: int = 0,
     out: Name | None = None,
 ) -> Grasps:
@@ -180,8 +189,8 @@ def sequence(
     from lgrasp.jobs.sequence.job import SequenceJob
 
     what = _asked(hand, n, pipeline, seed, device, workers, out)
-    names = [objects] if isinstance(objects, str | Path) else objects
-    return _done(SequenceJob, out, objects=tuple(map(str, names)), scale=str(scale), **what)
+    names = [objects] if isinstance(objects, str) or not isinstance(objects, Iterable) else objects
+    return _done(SequenceJob, out, objects=tuple(_named(name, "object") for name in names), scale=str(scale), **what)
 
 
 def plan(
@@ -191,7 +200,7 @@ def plan(
     starts: int = 80,
     model: Name | None = None,
     scale: float = 1.0,
-    device: str = "auto",
+    device: "DeviceName" = "auto",
     out: Name | None = None,
 ) -> Grasps:
     """Grasps of an object or a point cloud by local search: one per start that yields a valid plan.
@@ -206,11 +215,12 @@ def plan(
     """
     from lgrasp.jobs.refine.plan import PlanJob
 
-    points = isinstance(object, Cloud) or Path(object).suffix.lower() in POINT_SUFFIXES
-    what: dict[str, Any] = {"cloud" if points else "object": object if points else str(object)}
+    given = object if isinstance(object, Cloud) else _named(object, "object")
+    points = isinstance(given, Cloud) or Path(given).suffix.lower() in POINT_SUFFIXES
+    what: dict[str, Any] = {"cloud" if points else "object": given}
     what |= {} if isinstance(object, Cloud) else {"scale": scale}
-    what["model"] = None if model is None else str(model)
-    return _done(PlanJob, out, hand=str(hand), starts=starts, device=device, **what)
+    what["model"] = None if model is None else _named(model, "model")
+    return _done(PlanJob, out, hand=_named(hand, "hand"), starts=starts, device=device, **what)
 
 
 def refine(
@@ -218,7 +228,7 @@ def refine(
     *,
     coarse: bool = False,
     bounds: Any = None,
-    device: str = "auto",
+    device: "DeviceName" = "auto",
     out: Name | None = None,
     **params: int,
 ) -> Grasps:
@@ -248,7 +258,7 @@ def simulate(
     protocol: str | Protocol = "fc",
     *,
     all_directions: bool = False,
-    device: str = "cpu",
+    device: "DeviceName" = "cpu",
     workers: int = 0,
     out: Name | None = None,
 ) -> Grasps:
@@ -278,7 +288,8 @@ def open(path: Name) -> Grasps:
     Raises:
         LgraspError: no shard there, one that is damaged, or shards of several hands, objects or runs.
     """
-    return _made(find_shards([Path(path)]))
+    found = find_shards([Path(_named(path, "path", "a shard or a folder of shards"))])
+    return _made(found, nothing=f"{path}: no grasp in it")
 
 
 load = open
@@ -301,22 +312,22 @@ def read_cloud(path: Name, mask: Name | None = None, label: int | None = None, *
     return _read_cloud(path, mask, label, read_scene=scene_cloud, **options)
 
 
-def load_hand(name: Name, device: str = "cpu") -> Hand:
+def load_hand(name: Name, device: "DeviceName" = "cpu") -> Hand:
     """A hand by name, URDF, folder with hand.yaml, or shard.
 
     Raises:
         LgraspError: there is no such hand, or it cannot be used.
     """
-    return named_hand(Cache(), str(name), resolve_device(device))[1]
+    return named_hand(Cache(), _named(name, "name"), resolve_device(str(device)))[1]
 
 
-def load_object(name: Name, scale: float = 1.0, device: str = "cpu") -> Object:
+def load_object(name: Name, scale: float = 1.0, device: "DeviceName" = "cpu") -> Object:
     """An object by name or mesh file, or that of a shard.
 
     Raises:
         LgraspError: there is no such object, or it cannot be used.
     """
-    return named_object(Cache(), str(name), scale, resolve_device(device))
+    return named_object(Cache(), _named(name, "name"), scale, resolve_device(str(device)))
 
 
 def hands() -> dict[str, str]:
@@ -334,12 +345,32 @@ def pipelines() -> dict[str, str]:
     return {entry["name"]: entry["description"] for entry in list_pipelines()}
 
 
+def _named(value: Name, what: str, accepted: str = "a name or the path of a file") -> str:
+    """A name or path.
+
+    Raises:
+        ConfigError: something else, such as what was loaded by that name.
+    """
+    if not isinstance(value, str | PathLike):
+        raise ConfigError(f"{what} is a {type(value).__name__}; {accepted} is accepted")
+    return fspath(value)
+
+
 def _asked(
-    hand: Name, n: int, pipeline: Name | Pipeline, seed: int | None, device: str, workers: int, out: Name | None
+    hand: Name,
+    n: int,
+    pipeline: Name | Pipeline,
+    seed: int | None,
+    device: "DeviceName",
+    workers: int,
+    out: Name | None,
 ) -> dict[str, Any]:
     """What jobs that search have in common; without a folder all rows are in one shard."""
-    chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(str(pipeline))
-    what = {"hand": str(hand), "rows": n, "pipeline": chosen.with_seed(seed), "device": device, "workers": workers}
+    if not isinstance(n, Real):
+        raise ConfigError(f"n is {n!r}; a whole number is accepted")
+    chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(_named(pipeline, "pipeline"))
+    what: dict[str, Any] = {"hand": _named(hand, "hand"), "rows": n, "pipeline": chosen.with_seed(seed)}
+    what |= {"device": device, "workers": workers}
     return what | ({"shard_rows": max(n, 1)} if out is None else {})
 
 
@@ -357,13 +388,17 @@ def _folder(out: Name | None) -> Iterator[Path]:
 def _files(grasps: Grasps | Name) -> Iterator[tuple[Path, ...]]:
     """Shards or folders of them that hold grasps."""
     if not isinstance(grasps, Grasps):
-        yield (Path(grasps),)
+        yield (Path(_named(grasps, "grasps", "grasps, a shard, or a folder of shards")),)
         return
     if not len(grasps):
-        raise ConfigError(f"there are {grasps!r}; at least one is needed")
+        raise ConfigError("0 grasps are given; at least one is needed")
     with _folder(None) as folder:
         folder.mkdir()
-        yield (grasps.save(folder / f"{grasps.hand.name}-{grasps.objects[0].id}-00000.h5"),)
+        file = folder / f"{grasps.hand.name}-{grasps.objects[0].id}-00000.h5"
+        try:
+            yield (grasps.save(file),)
+        except LgraspError as error:
+            raise type(error)(str(error).replace(str(file), "grasps")) from None
 
 
 def _done(kind: type[Job], out: Name | None, asked: int = 0, **options: Any) -> Grasps:
@@ -373,10 +408,10 @@ def _done(kind: type[Job], out: Name | None, asked: int = 0, **options: Any) -> 
         return _made(run(job).paths, asked)
 
 
-def _made(paths: Sequence[Path], asked: int = 0) -> Grasps:
-    """Rows of the files of one run."""
+def _made(paths: Sequence[Path], asked: int = 0, nothing: str = "no grasp found") -> Grasps:
+    """Rows of the files of one run; StarvedError with ``nothing`` where there are none."""
     if not paths:
-        raise StarvedError("no grasp found")
+        raise StarvedError(nothing)
     if len(paths) == 1:
         shard = read_shard(paths[0])
     else:
@@ -386,7 +421,7 @@ def _made(paths: Sequence[Path], asked: int = 0) -> Grasps:
             shard = read_shard(folder / "all.h5")
     found = Grasps.of_shard(shard)
     if not len(found):
-        raise StarvedError("no grasp found")
+        raise StarvedError(nothing)
     if len(found) < asked:
         warnings.warn(f"{len(found):,} of {asked:,} grasps found", stacklevel=4)
     return found

@@ -3,12 +3,21 @@
 import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 
 from lgrasp.errors import ConfigError
 from lgrasp.notices import notice
@@ -18,6 +27,9 @@ Model = TypeVar("Model", bound=BaseModel)
 
 _YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _YAML_DEPTH, _YAML_BYTES = 64, 4 << 20
+
+_AS_OPTIONS = {"object": "objects", "set": "settings", "n": "rows"}
+"""What keys are called on the command line -> keys."""
 
 
 def device_name(name: str) -> str:
@@ -62,7 +74,9 @@ Numbers = tuple[float, float, float]
 
 # fields that several models have
 Seed = Annotated[int, Field(ge=0, lt=2**63, description="Decides every random draw.")]
-DeviceName = Annotated[str, AfterValidator(device_name), Field(description="auto, cpu or cuda:N.")]
+DeviceName = Annotated[
+    str, BeforeValidator(str), AfterValidator(device_name), Field(description="auto, cpu or cuda:N.")
+]
 Workers = Annotated[int, Field(ge=0, description="Threads or processes; 0: by device.")]
 HandName = Annotated[str, Field(description="Name or path.")]
 HandNames = Annotated[tuple[str, ...], Field(min_length=1, description="Names, paths, folders of hands, or globs.")]
@@ -131,7 +145,7 @@ def find_yaml(name: str, files: Mapping[str, Path], what: str) -> Path:
 
 def load_yaml(text: str | bytes) -> Any:
     """What a YAML text says: plain values, at most 64 inside each other, aliases that stand for no more values than the
-    text has letters; any parser and whoever walks through the values survives that.
+    text has letters, no key twice; any parser and whoever walks through the values survives that.
 
     Raises:
         yaml.YAMLError: no such text.
@@ -139,7 +153,7 @@ def load_yaml(text: str | bytes) -> Any:
     sizes: dict[str, int] = {}  # values behind each anchor
     inside: list[tuple[str | None, int]] = []  # (anchor, values before) of the collections around
     values = 0
-    for event in yaml.parse(text, Loader=_YAML):
+    for event in _keys_once(yaml.parse(text, Loader=_YAML)):
         where = f"line {event.start_mark.line + 1}"
         if isinstance(event, yaml.CollectionStartEvent):
             inside.append((event.anchor, values))
@@ -160,6 +174,24 @@ def load_yaml(text: str | bytes) -> Any:
         if values > len(text):
             raise yaml.YAMLError(f"{where}: aliases stand for more values than are read")
     return yaml.load(text, Loader=_YAML)
+
+
+def _keys_once(events: Iterable[Any]) -> Iterator[Any]:
+    """The events of a YAML text; an error where a mapping has a key twice, of which parsers take the last."""
+    inside: list[tuple[set[str] | None, bool]] = []  # keys (None: a list), and if a key is next, of the collections
+    for event in events:
+        if isinstance(event, yaml.NodeEvent) and inside and (keys := inside[-1][0]) is not None:
+            is_key = inside[-1][1]
+            if is_key and isinstance(event, yaml.ScalarEvent):
+                if event.value in keys:
+                    raise yaml.YAMLError(f"line {event.start_mark.line + 1}: key '{event.value}' is given twice")
+                keys.add(event.value)
+            inside[-1] = keys, not is_key
+        if isinstance(event, yaml.CollectionStartEvent):
+            inside.append((set() if isinstance(event, yaml.MappingStartEvent) else None, True))
+        elif isinstance(event, yaml.CollectionEndEvent):
+            inside.pop()
+        yield event
 
 
 def load_yaml_file(path: Path) -> Any:
@@ -211,7 +243,8 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
         first, key = first_problem(error)
         if first["type"] == "extra_forbidden":
             name, valid = str(first["loc"][-1]), _keys_at(model, first["loc"][:-1])
-            hint = did_you_mean(name, valid)
+            meant = _AS_OPTIONS.get(name)
+            hint = did_you_mean(meant if meant in valid else name, valid)
             raise ConfigError(f"{where}: unknown key '{key}'; {hint}valid keys: {', '.join(valid)}") from None
         if first["type"] == "missing":
             raise ConfigError(f"{where}: key '{key}' is missing") from None
@@ -219,7 +252,31 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
             raise ConfigError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
         value = repr(first["input"])
         shown = value if len(value) <= 100 else f"{value[:97]}..."
-        raise ConfigError(f"{where}: key '{key}' = {shown}: {first['msg'].removeprefix('Value error, ')}") from None
+        raise ConfigError(f"{where}: key '{key}' = {shown}: {_reason(first)}") from None
+
+
+def _reason(problem: Any) -> str:
+    """What a pydantic error says, in the words of YAML."""
+    kind, given = problem["type"], problem["input"]
+    if kind in ("tuple_type", "list_type"):
+        return f"give a list: [{given}]" if isinstance(given, str | int | float) else "give a list: [..., ...]"
+    if kind in ("dict_type", "model_type", "model_attributes_type"):
+        return "give keys with values: {KEY: VALUE}"
+    return _PLAIN.get(kind) or problem["msg"].removeprefix("Value error, ")
+
+
+_PLAIN = {
+    "int_type": "give a whole number",
+    "int_parsing": "give a whole number",
+    "int_from_float": "give a whole number",
+    "float_type": "give a number",
+    "float_parsing": "give a number",
+    "bool_type": "give true or false",
+    "bool_parsing": "give true or false",
+    "string_type": "give a text",
+    "path_type": "give a path",
+}
+"""What to say of kinds of pydantic errors."""
 
 
 def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], where: str) -> dict[str, BaseModel]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from support.places import QUICK
 
 import lgrasp as lg
@@ -48,6 +49,7 @@ def test_some_of_the_rows(grasps, tmp_path):
     assert repr(some) == "<6 grasps of sphere by allegro, pipeline quick>"
     np.testing.assert_array_equal(grasps[[3, 1]].metrics["gap"], grasps.metrics["gap"][[3, 1]])
     assert len(grasps[2:5]) == 3
+    assert len(grasps[[]]) == len(grasps[np.zeros(12, bool)]) == 0
     read = lg.read_shard(some.save(tmp_path / "some.h5"))
     assert len(read.grasps) == 6
     np.testing.assert_array_equal(read.grasps.contact_links, some.contact_links)
@@ -92,9 +94,16 @@ def test_plan():
 def test_what_cannot_be_used_is_an_error_of_this_package(grasps, tmp_path):
     none = grasps[np.zeros(len(grasps), bool)]
     for use in (lg.refine, lg.simulate, lg.Grasps.show):
-        with pytest.raises(lg.LgraspError, match="<0 grasps of sphere by allegro") as caught:
+        with pytest.raises(lg.LgraspError, match=r"^0 grasps are given; at least one is needed$"):
             use(none)
-        assert "lgrasp." not in str(caught.value)
+    empty = none.save(tmp_path / "empty.h5")
+    with pytest.raises(lg.LgraspError, match=r"empty\.h5: no grasp in it"):
+        lg.open(empty)
+    spoilt = grasps[:3]
+    spoilt.q[1, 2] = np.nan
+    for use in (lg.refine, lg.simulate, lg.judge):
+        with pytest.raises(lg.LgraspError, match=r"^grasps/q: not finite \(row 1, 1 rows\)$"):
+            use(spoilt)
     for rows in (0, -3):
         with pytest.raises(lg.LgraspError, match=f"rows is {rows}; how many"):
             grasps.show(rows)
@@ -103,6 +112,33 @@ def test_what_cannot_be_used_is_an_error_of_this_package(grasps, tmp_path):
         lg.plan("allegro", tmp_path / "few.npy", device="cpu")
     with pytest.raises(lg.LgraspError, match="at least two objects, got spere"):
         lg.sequence("allegro", "spere", device="cpu")
+    for n in ("5", None):
+        with pytest.raises(lg.LgraspError, match=r"n is .*; a whole number is accepted"):
+            lg.generate("allegro", "sphere", n)
+
+
+def test_names_and_no_models():
+    """Names are told from what is loaded by them, in one line; numbers and devices of other libraries are taken."""
+    hand, ball = lg.load_hand("allegro"), lg.load_object("sphere")
+    for use in (
+        lambda: lg.generate(hand, "sphere"),
+        lambda: lg.generate("allegro", ball),
+        lambda: lg.sequence("allegro", ball),
+        lambda: lg.sequence("allegro", ["sphere", ball]),
+        lambda: lg.plan("allegro", ball),
+        lambda: lg.plan(hand, "sphere"),
+        lambda: lg.load_hand(hand),
+        lambda: lg.load_object(np.zeros((9, 3))),
+    ):
+        with pytest.raises(lg.LgraspError, match=r"is a (HandModel|ObjectModel|ndarray); a name or the path of a file"):
+            use()
+    with pytest.raises(lg.LgraspError, match="grasps is a ObjectModel; grasps, a shard, or a folder"):
+        lg.refine(ball)
+    with pytest.raises(lg.LgraspError, match=r"seed 1\.5: need a whole number"):
+        lg.generate("allegro", "sphere", 1, seed=1.5)
+    count = np.int64(1)
+    made = lg.generate("allegro", "sphere", count, pipeline=QUICK, device=torch.device("cpu"), seed=np.int64(3))
+    assert (len(made), made.header.seed) == (1, 3)
 
 
 def test_sequence():

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from importlib import import_module
+from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, Field, SerializeAsAny
+from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny
 
 from lgrasp.config import Params, Seed, apply_settings, did_you_mean, find_yaml, parse_model, read_yaml, yaml_files
 from lgrasp.engine.registry import SEQUENCE, STAGES, Stage, check_order
@@ -213,9 +214,11 @@ class Pipeline(_Head):
         Raises:
             ConfigError: seed out of range.
         """
-        if seed is not None and not 0 <= seed < 2**63:
-            raise ConfigError(f"{name} {seed}: need 0 <= seed < 2^63")
-        return self if seed is None else self.model_copy(update={"seed": seed})
+        if seed is None:
+            return self
+        if not (isinstance(seed, Integral) and 0 <= seed < 2**63):
+            raise ConfigError(f"{name} {seed}: need a whole number, 0 <= seed < 2^63")
+        return self.model_copy(update={"seed": int(seed)})
 
     def impatient(self, **changes: Any) -> "Pipeline":
         """A copy whose shards end after their effort, for runs to which few grasps are a result, too."""
@@ -297,3 +300,11 @@ def load_pipeline(name: str) -> Pipeline:
         stages=tuple(stages),
         sequence=None if sequence is None else parse_model(SEQUENCE.params, sequence, f"{where}, {SEQUENCE.name}"),
     ).checked()
+
+
+NamedPipeline = Annotated[
+    Pipeline,
+    BeforeValidator(lambda given: load_pipeline(given) if isinstance(given, str) else given),
+    Field(description="Name or path."),
+]
+"""A pipeline, or its name."""
