@@ -74,6 +74,7 @@ Numbers = tuple[float, float, float]
 
 # fields that several models have
 Seed = Annotated[int, Field(ge=0, lt=2**63, description="Decides every random draw.")]
+OtherSeed = Annotated[int | None, Field(ge=0, lt=2**63, description="Replaces the pipeline's own.")]
 DeviceName = Annotated[
     str, BeforeValidator(str), AfterValidator(device_name), Field(description="auto, cpu or cuda:N.")
 ]

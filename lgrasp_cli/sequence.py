@@ -1,6 +1,5 @@
 """``lgrasp sequence`` and ``lgrasp sample``: several objects in one hand, one after another."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,11 +53,12 @@ def sequence(
 
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """
+    from lgrasp.jobs.config import sequence_folder
     from lgrasp.jobs.requests.search import SequenceRequest
 
     chosen = _chosen(pipeline, seed, settings, method=method, policy=policy)
     what: dict[str, Any] = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen}
-    what |= {"out": out or _folder(hand, objects, chosen, simulate), "scale": scale, "simulate": simulate}
+    what |= {"out": out or sequence_folder(hand, objects, chosen, simulate), "scale": scale, "simulate": simulate}
     how.run(how.job(SequenceRequest, "sequence", shard_rows=shard_rows, **what), _show, _profile)
 
 
@@ -98,6 +98,7 @@ def sample(
     Example: lgrasp sample seq-allegro --cloud mug.npz --cloud ball.ply -n 16
     """
     from lgrasp.cloud.suffixes import cloud_names
+    from lgrasp.jobs.config import sequence_folder
     from lgrasp.jobs.requests.search import SampleRequest
     from lgrasp.learn.networks import with_network_hand
 
@@ -106,25 +107,15 @@ def sample(
     what = with_network_hand({"hand": hand, "model": model})
     what |= {"objects": objects, "rows": rows, "pipeline": chosen, "scale": scale}
     what |= {"clouds": cloud, "masks": mask, "labels": label, "viewpoint": position(viewpoint)}
-    what |= {"out": out or _folder(what["hand"], names, chosen, simulate), "simulate": simulate}
+    what |= {"out": out or sequence_folder(what["hand"], names, chosen, simulate), "simulate": simulate}
     how.run(how.job(SampleRequest, "sample", shard_rows=shard_rows, **what), _show, _profile)
 
 
 def _chosen(name: str, seed: int | None, settings: list[str] | None, **changes: str | None) -> "Pipeline":
     """The pipeline with what the options change."""
-    chosen = choose_pipeline(name, seed, settings=settings)
-    if chosen.sequence is None:
-        return chosen
-    return chosen.with_params("sequence", **given(**changes))
+    from lgrasp.jobs.requests.search import SequencePipeline
 
-
-def _folder(hand: str, objects: Sequence[str], pipeline: "Pipeline", simulate: str | None) -> Path:
-    """Where the shards go unless it is said."""
-    from lgrasp.engine.folder import run_folder
-    from lgrasp.jobs.config import hand_name
-    from lgrasp.jobs.sets import sequence_name
-
-    return run_folder(Path("grasps"), hand_name(hand), sequence_name(tuple(objects)), pipeline.name, simulate)
+    return SequencePipeline(pipeline=choose_pipeline(name, seed, settings=settings), **given(**changes)).made()
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

@@ -303,8 +303,6 @@ def load_pipeline(name: str) -> Pipeline:
 
 
 NamedPipeline = Annotated[
-    Pipeline,
-    BeforeValidator(lambda given: load_pipeline(given) if isinstance(given, str) else given),
-    Field(description="Name or path."),
+    Pipeline, BeforeValidator(lambda given: load_pipeline(given) if isinstance(given, str) else given)
 ]
 """A pipeline, or its name."""

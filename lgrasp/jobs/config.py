@@ -156,7 +156,12 @@ def load_requests(name: str, changes: dict[str, Any]) -> ConfigJobs:
     if kind == "generate" or "sequences" in data:
         return ConfigJobs(plan_requests(parse_model(JobConfig, data, f"config {path}")), devices)
     data.pop("description", None)
-    return ConfigJobs([parse_model(named(KINDS[kind]), data, f"config {path}")], devices)
+    model = named(KINDS[kind])
+    usual = "out" not in data and issubclass(model, SequenceRequest)
+    request = parse_model(model, data | ({"out": Path()} if usual else {}), f"config {path}")
+    if usual:
+        request.out = sequence_folder(request.hand, request.names, request.pipeline, request.simulate)
+    return ConfigJobs([request], devices)
 
 
 def plan_requests(config: JobConfig) -> list[Request]:
@@ -233,6 +238,11 @@ def _names(hand: str, mesh: str) -> tuple[str, str]:
         names = names[0], find_object(mesh).stem
         names = hand_name(hand), names[1]
     return names
+
+
+def sequence_folder(hand: str, objects: Sequence[str], pipeline: Pipeline, protocol: str | None) -> Path:
+    """Where the shards of sequences go unless it is said."""
+    return run_folder(Path("grasps"), hand_name(hand), sequence_name(tuple(objects)), pipeline.name, protocol)
 
 
 def hand_name(hand: str) -> str:

@@ -95,6 +95,7 @@ def test_archives_that_unpack_without_end(tmp_path):
 
 def test_plain_yaml_is_read():
     assert load_yaml("a: {b: [1, 2.5, x, null]}\nc: 'd'") == {"a": {"b": [1, 2.5, "x", None]}, "c": "d"}
+    assert load_yaml("a: &x {k: 1}\nb: {<<: *x, k: 2}\nc: [k, k, {k: k}]")["b"] == {"k": 2}
     assert load_yaml("a: &a [1, 2]\nb: *a\nc: [*a, *a]") == {"a": [1, 2], "b": [1, 2], "c": [[1, 2], [1, 2]]}
 
 

@@ -189,8 +189,16 @@ def test_run_on_several_devices(cli, tmp_path, monkeypatch):
     ("text", "words"),
     [
         ("objects: [tiny]\nrow: 5", "did you mean 'rows'"),
+        ("object: [tiny]", "did you mean 'objects'"),
+        ("objects: [tiny]\nn: 5", "did you mean 'rows'"),
+        ("objects: [tiny]\nset: []", "did you mean 'settings'"),
         ("objects: []", "objects"),
+        ("objects: tiny", "key 'objects' = 'tiny': give a list: [tiny]"),
         ("objects: [tiny]\nrows: 0", "rows"),
+        ("objects: [tiny]\nrows: many", "key 'rows' = 'many': give a whole number"),
+        ("objects: [tiny]\nrows: 5\nrows: 6", "line 3: key 'rows' is given twice"),
+        ("job: sequence\nobjects: [tiny, tiny]\npipeline: sequnce", "did you mean 'sequence'"),
+        ("job: sequence\nobjects: [tiny, tiny]\nseed: x", "c.yaml: key 'seed' = 'x': give a whole number"),
         ("objects: [tiny]\npipelines: [swfit]", "did you mean 'swift'"),
         ("objects: [tiny]\nobject_dir: nowhere", "nowhere"),
         ("objects: [tiny]\ndevice: cpu,gpu", "key 'device' = 'cpu,gpu': device 'gpu' cannot be"),
@@ -199,6 +207,24 @@ def test_run_on_several_devices(cli, tmp_path, monkeypatch):
 def test_wrong_configs(cli, tmp_path, text, words):
     (tmp_path / "c.yaml").write_text(text)
     assert words in cli("run", tmp_path / "c.yaml").error()
+
+
+def test_jobs_have_the_names_and_defaults_of_their_commands(tmp_path):
+    from lgrasp.jobs.config import load_requests
+
+    def asked(text):
+        (tmp_path / "c.yaml").write_text(text)
+        return load_requests(str(tmp_path / "c.yaml"), {}).requests[0]
+
+    plain = asked("job: sequence\nobjects: [mug, sphere]")
+    assert (plain.pipeline.name, str(plain.out)) == ("sequence", "grasps/allegro-mug-sphere/sequence")
+    other = "pipeline: sample\nseed: 7\npolicy: lookahead\nsettings: [bounds.friction=0.7]\nscale: 0.5\nout: x"
+    chosen = asked(f"job: sequence\nobjects: [mug, sphere]\n{other}")
+    assert (chosen.pipeline.name, chosen.pipeline.seed, chosen.pipeline.bounds.friction) == ("sample", 7, 0.7)
+    assert (chosen.pipeline.sequence.policy, chosen.scale, str(chosen.out)) == ("lookahead", "0.5", "x")
+    assert asked("job: simulate\nshards: [x]").protocol.name == "fc"
+    assert asked("job: sample\nobjects: [mug, sphere]\nmodel: seq-allegro").pipeline.name == "sample"
+    assert asked("job: policy\npipeline: swift").pipeline.name == "swift"
 
 
 def test_shipped_configs(cli):

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple, cast, get_args
 from pydantic import Field, field_validator
 
 from lgrasp.choices import ProtocolName, VariationName
-from lgrasp.config import HandNames, did_you_mean
+from lgrasp.config import HandNames, OtherSeed, did_you_mean
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
@@ -48,7 +48,7 @@ class CompareRequest(Request):
     )
     simulate: ProtocolName | None = Field(default=None, description="Protocol by which grasps are simulated.")
     pipeline: str = Field(default="robust", description="Name or path.")
-    seed: int | None = Field(default=None, ge=0, lt=2**63, description="Replaces the pipeline's own.")
+    seed: OtherSeed = None
     out: Path = Field(default=Path("compare"), description="Folder for the folders HAND-OBJECT/PIPELINE and the page.")
 
     @field_validator("vary", mode="before")

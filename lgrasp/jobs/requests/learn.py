@@ -6,7 +6,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from lgrasp.config import HandName, MeshScale
-from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.engine.pipeline import NamedPipeline, load_pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.files import check_folder
@@ -24,7 +24,7 @@ class PolicyRequest(Request):
     hand: HandName = "allegro"
     objects: tuple[str, ...] = Field(default=(), description="Names or mesh files to learn from; none: random shapes.")
     scale: MeshScale = 1.0
-    pipeline: Pipeline = Field(default_factory=lambda: load_pipeline("robust"))
+    pipeline: NamedPipeline = Field(default_factory=lambda: load_pipeline("robust"))
     out: Path = Field(default=Path("policy.npz"), description="File of the policy.")
     params: PosePolicyParams = Field(default_factory=lambda: PosePolicyParams.model_validate({}))
 

@@ -5,13 +5,13 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
-from lgrasp.choices import ProtocolName
+from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
-from lgrasp.config import HandName, Negatives, ShardFolder, Viewpoint
+from lgrasp.config import HandName, Negatives, OtherSeed, Params, ShardFolder, Viewpoint, parse_model
 from lgrasp.engine.folder import check_number
-from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.pipeline import NamedPipeline, Pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
@@ -28,7 +28,7 @@ class SearchRequest(Request):
 
     hand: HandName = "allegro"
     rows: int = Field(default=1000, description="Rows requested.")
-    pipeline: Pipeline
+    pipeline: NamedPipeline
     out: ShardFolder
     shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
 
@@ -88,11 +88,29 @@ class GenerateRequest(SearchRequest):
         super().check()
 
 
+class SequencePipeline(Params):
+    """A pipeline of sequences by the options of the command, which are keys of a config too."""
+
+    pipeline: NamedPipeline
+    settings: tuple[str, ...] = ()
+    seed: OtherSeed = None
+    method: Method | None = None
+    policy: Policy | None = None
+
+    def made(self) -> Pipeline:
+        """The pipeline with all changes."""
+        made = self.pipeline.with_settings(self.settings).with_seed(self.seed)
+        changes = self.model_dump(include={"method", "policy"}, exclude_none=True)
+        return made.with_params("sequence", **changes) if changes and made.sequence else made
+
+
 class SequenceRequest(SearchRequest):
     """Sequences of grasps of several objects by one hand."""
 
     RENAMED: ClassVar[dict[str, str]] = {"physics": "simulate"}
 
+    usual: ClassVar[str] = "sequence"
+    """The pipeline unless one is chosen."""
     maker: ClassVar[str] = "lgrasp.jobs.sequence.job:SequenceJob"
     unit: ClassVar[str] = "sequences"
 
@@ -100,11 +118,25 @@ class SequenceRequest(SearchRequest):
         default=(), description="Names or mesh files, in the order in which they are grasped."
     )
     rows: int = Field(default=256, description="Complete sequences requested.")
-    scale: str = Field(default="1", description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.")
+    scale: str = Field(
+        default="1",
+        coerce_numbers_to_str=True,
+        description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.",
+    )
     simulate: ProtocolName | None = Field(
         default=None, description="Protocol that the rows of every step must pass to be continued."
     )
     shard_rows: int = Field(default=1000, description="Sequences of a shard; part of what decides the rows.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _choose(cls, asked: Any, info: ValidationInfo) -> Any:
+        if not isinstance(asked, dict) or isinstance(asked.get("pipeline"), Pipeline):
+            return asked
+        own, where = SequencePipeline.model_fields, (info.context or {}).get("where", cls.usual)
+        chosen = {"pipeline": cls.usual} | {name: value for name, value in asked.items() if name in own}
+        made = parse_model(SequencePipeline, chosen, where).made()
+        return {name: value for name, value in asked.items() if name not in own} | {"pipeline": made}
 
     @property
     def title(self) -> str:
@@ -143,6 +175,7 @@ class SequenceRequest(SearchRequest):
 class SampleRequest(SequenceRequest):
     """Sequences whose steps are drawn by a trained network."""
 
+    usual: ClassVar[str] = "sample"
     maker: ClassVar[str] = "lgrasp.jobs.sequence.sample:SampleJob"
 
     model: str = Field(description="File of lgrasp learn fit --model diffuser, or a name of lgrasp learn list.")

@@ -52,7 +52,7 @@ class SimulateRequest(VerdictRequest):
 
     maker: ClassVar[str] = "lgrasp.jobs.simulate:SimulateJob"
 
-    protocol: Protocol = Field(description="Named protocol.")
+    protocol: Protocol = Field(default_factory=lambda: find_protocol("fc"), description="Named protocol.")
     engine: EngineName | None = Field(default=None, description="Simulator; default: the protocol's, MuJoCo.")
     device: DeviceName = "cpu"
     all_directions: bool = Field(
