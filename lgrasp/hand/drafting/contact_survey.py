@@ -18,6 +18,7 @@ from lgrasp.hand.urdf import Urdf
 _MIN_TIP_AREA = 5.0e-5  # [m^2] distal half of a fingertip
 _PALM_SPREAD = 45.0  # [degrees]
 _MIN_LINK_AREA = 2.0e-5  # [m^2] contact surface of a link
+_MIN_INNER, _INNER_SHARE = 1.0e-4, 0.7  # [m^2] and share of the last body's, seen of the body before
 _MIN_PALM_AREA = 3.0e-4  # [m^2]
 _PALM_REACH = 0.10  # [m] from the palm to what is held
 _ONE_SIDED_RATIO = 2.0  # ratio of a joint's room to both sides, for it to bend to one
@@ -70,7 +71,7 @@ def survey_contacts(
     elif len(tips) == 1 and any(s.body == 0 for s in surfaces):
         tips[0] = _nearest_static(surfaces, postures, used[0], tips[used[0]])
     surfaces = surface_visibility(surfaces, postures, tips)
-    sides = {tip: found for tip in used if (found := _finger_sides(structure, model, surfaces, tip))}
+    sides = _contact_sides(structure, model, surfaces, used)
     touches: dict[int, Touch] = {}
     for tip, found in sides.items():
         group = int(tree.body_group[tip])
@@ -103,23 +104,47 @@ def _allowed(sides: list[Side], body: int) -> tuple[np.ndarray, np.ndarray]:
     return np.vstack([s.samples.points[s.chosen] for s in own]), np.vstack([s.samples.normals[s.chosen] for s in own])
 
 
-def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[SurfaceSamples], tip: int) -> list[Side]:
-    """Contact links of one finger.
+def _contact_sides(
+    structure: FingerStructure, model: HandModel, surfaces: list[SurfaceSamples], tips: tuple[int, ...]
+) -> dict[int, list[Side]]:
+    """Contact links of fingers by their last body, the most distal first.
 
     A finger of three drives or more touches with the distal half of its last body, which it can turn any way, and the
     rest of the finger stays clear; with its sides as well where the end is flat. One of fewer drives needs all its
-    palmar surface, that of the body before included.
+    palmar surface, that of the body before included where as much of it is seen: on the mean of alike fingers.
     """
+    found = {tip: _finger_sides(structure, model, surfaces, tip) for tip in tips}
+    alike: dict[tuple[int, ...], list[int]] = {}
+    for tip, finger in found.items():
+        if all(finger):
+            mm2 = (round(1e6 * side.samples.area) for own in finger for side in own)
+            alike.setdefault(tuple(mm2), []).append(tip)
+    for same in alike.values():
+        outer, inner = (np.mean([_shown(found[tip][which]) for tip in same]) for which in (0, 1))
+        if inner > _INNER_SHARE * outer and inner > _MIN_INNER:
+            found |= {tip: ([*found[tip][0], *found[tip][1]], []) for tip in same}
+    return {tip: own for tip, (own, _) in found.items() if own}
+
+
+def _shown(sides: list[Side]) -> float:
+    """Surface that is seen on the mean [m^2]."""
+    return sum(s.area * float(s.samples.seen[s.chosen].mean()) for s in sides)
+
+
+def _finger_sides(
+    structure: FingerStructure, model: HandModel, surfaces: list[SurfaceSamples], tip: int
+) -> tuple[list[Side], list[Side]]:
+    """What may touch of a finger's last body, and of the one before."""
     distal = [s for s in surfaces if s.body == tip]
     axis, along, across = _palmar_axes(model, distal, tip)
     if axis is None:
-        return []
+        return [], []
     if across is not None and len(structure.driven_by(tip)) >= 3:
         rounded = sum(s.area * ((s.normals @ along > 0.05) & (s.normals @ across > 0.5)).mean() for s in distal)
         behind = 91.0 if rounded > _MIN_TIP_AREA else 80.0  # degrees; sides that are square to the end are at 90
         sides = _sides(distal, [(-along, behind), (-across, 60.0)], _MIN_TIP_AREA)
         if sides:
-            return sides
+            return sides, []
     if across is not None:
         axis = across + 0.5 * along
         axis /= np.linalg.norm(axis)
@@ -130,11 +155,8 @@ def _finger_sides(structure: FingerStructure, model: HandModel, surfaces: list[S
         siblings = [t for t in structure.tips if t != tip and before in structure.tree.path(t)]
         axis = _palmar_axes(model, inner, before)[0] if inner and not siblings else None
         if axis is not None:
-            more = _sides(inner, [(-axis, 120.0)], _MIN_LINK_AREA)
-            shown = sum(s.samples.seen[s.chosen].mean() * s.area for s in more)
-            if shown > 0.7 * sum(s.samples.seen[s.chosen].mean() * s.area for s in sides) and shown > 1e-4:
-                sides += more
-    return sides
+            return sides, _sides(inner, [(-axis, 120.0)], _MIN_LINK_AREA)
+    return sides, []
 
 
 def _palmar_axes(

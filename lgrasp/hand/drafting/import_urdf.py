@@ -31,7 +31,7 @@ from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
 from lgrasp.hand.urdf import check_robot, find_mesh, is_mjcf, read_robot
 from lgrasp.paths import cache_dir, user_dir
 
-_DRAFT_VERSION = 4
+_DRAFT_VERSION = 5
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
 

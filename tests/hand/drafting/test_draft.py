@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from support.places import ROOT
-from support.urdfs import fingers, gripper, rods
+from support.urdfs import BAR, PHALANX, fingers, gripper, rods
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
@@ -68,6 +68,24 @@ def test_fingers_touch_with_the_side_that_they_bend_to(tmp_path):
         pad, end, back = ((n @ axis > 0.95).mean() for axis in ([0, -1, 0], [0, 0, 1], [0, 1, 0]))
         assert min(pad, end) > 0.05
         assert back == 0
+
+
+@pytest.mark.usefixtures("no_spaces")
+def test_alike_fingers_touch_with_the_same_links(tmp_path):
+    """Three in a row and one that faces them, whose inner links are seen about as much as rules ask for."""
+    joint = (
+        '<joint name="{c}" type="revolute"><parent link="{p}"/><child link="{c}"/>{at}<limit lower="0" upper="1.6"/>'
+    )
+    parts = ['<link name="base"><collision><geometry><box size="0.09 0.09 0.024"/></geometry></collision></link>']
+    for i, (x, y, s) in enumerate(((-0.025, 0.05, 1), (0, 0.05, 1), (0.025, 0.05, 1), (0, -0.05, -1))):
+        root = f'<origin xyz="{x} {y} 0" rpy="{-1.5708 * s} 0 0"/>'
+        for p, c, origin in (("base", f"a{i}", root), (f"a{i}", f"b{i}", '<origin xyz="0 0 0.045"/>')):
+            at = f'{origin}<axis xyz="{s} 0 0"/>'
+            parts.append(PHALANX.format(n=c, geometry=BAR.replace("0.05", "0.04")) + joint.format(p=p, c=c, at=at))
+            parts.append("</joint>")
+    (tmp_path / "row.urdf").write_text(f'<robot name="row">{"".join(parts)}</robot>')
+    links = contact_links(draft_spec(tmp_path / "row.urdf")[0])
+    assert links == {f"{link}{i}" for i in range(4) for link in "ab"}
 
 
 @pytest.mark.usefixtures("no_spaces")
