@@ -18,10 +18,14 @@ def list_objects() -> dict[str, Path]:
     """Named objects (mesh files in the ``objects`` folders, first folder wins) and their files, sorted by name."""
     found: dict[str, Path] = {}
     for folder in data_dirs("objects"):
-        for path in sorted(folder.iterdir()):
-            if _is_mesh(path):
-                found.setdefault(path.stem, path)
+        found = mesh_files(folder) | found
     return dict(sorted(found.items()))
+
+
+def mesh_files(folder: Path) -> dict[str, Path]:
+    """Mesh files in a folder, which need not exist, by their names; of several with one name the first."""
+    files = sorted(folder.iterdir(), reverse=True) if folder.is_dir() else []
+    return {path.stem: path for path in files if _is_mesh(path)}
 
 
 def all_objects(names: Iterable[str]) -> tuple[str, ...]:

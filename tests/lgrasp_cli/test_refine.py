@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from lgrasp.dataset.exports.formats import read_grasps
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
@@ -205,8 +206,16 @@ def test_an_object_in_two_scales(cli, export, tmp_path):
 def test_exports_of_another_hand_or_without_a_mesh(cli, export, tmp_path):
     base = [export(), "--from", "dexgraspnet", "--device", "cpu", "--out", tmp_path / "x", "--hand"]
     assert "entry 0: lacks joint 'finger_1_med_joint'" in cli("refine", *base, "barrett").error()
-    (tmp_path / "export/objects/tiny.obj").unlink()
+    mesh = (tmp_path / "export/objects/tiny.obj").rename(tmp_path / "tiny.obj")
     assert "objects/tiny.obj: does not exist" in cli("refine", *base, "allegro").error()
+    (tmp_path / "bare/objects").mkdir(parents=True)  # what another program writes
+    (tmp_path / "export/grasps").rename(tmp_path / "bare/grasps")
+    base[0] = tmp_path / "bare"
+    line = cli("refine", *base, "allegro").error()
+    assert f"no mesh of object 'tiny'; {tmp_path}/bare/objects/tiny.obj (or .stl, " in line
+    trimesh.load_mesh(mesh).export(tmp_path / "bare/objects/tiny.stl")
+    for place in ("bare", "bare/grasps", "bare/grasps/tiny.npy"):
+        assert [o.mesh.name for o in read_grasps(tmp_path / place, "dexgraspnet").objects] == ["tiny.stl"]
     assert "choose dexgraspnet" in cli("refine", "export", "--from", "x", *base[3:], "allegro").error()
     assert not (tmp_path / "x").exists()
 

@@ -14,6 +14,7 @@ from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import canonical, inverse
 from lgrasp.grasp.records import GraspRows
+from lgrasp.object.find import mesh_files
 
 
 class ReadObject(NamedTuple):
@@ -117,6 +118,12 @@ class ExportFolder:
         return GraspSet(self.wanted, tuple(self.objects), grasps)
 
 
+def objects_beside(path: Path) -> Path:
+    """Where the meshes of objects are that grasps in a folder or file name: ``objects`` beside ``grasps``."""
+    folder = path if path.is_dir() else path.parent
+    return (folder.parent if folder.name == GRASPS else folder) / OBJECTS
+
+
 def open_folder(path: Path | str, suffix: str, layout: str, wanted: Sequence[str] | None) -> ExportFolder:
     """Find the files of grasps in an export, in any other folder, or take a single file.
 
@@ -124,8 +131,9 @@ def open_folder(path: Path | str, suffix: str, layout: str, wanted: Sequence[str
         ShardError: No such folder, no file with the suffix, an export of another format, or one that is not whole.
     """
     path, order = Path(path), tuple(wanted or ())
+    beside = mesh_files(objects_beside(path))
     if path.is_file():
-        return ExportFolder(path, (path,), order)
+        return ExportFolder(path, (path,), order, meshes=beside)
     if not path.is_dir():
         raise ShardError(f"{path}: no such file or folder")
     index, urdf = path / INDEX, path / HAND / "hand.urdf"
@@ -135,7 +143,7 @@ def open_folder(path: Path | str, suffix: str, layout: str, wanted: Sequence[str
     if not files:
         raise ShardError(f"{path}: no {suffix} file in it")
     if not index.exists():
-        return ExportFolder(path, files, order)
+        return ExportFolder(path, files, order, meshes=beside)
     with parsing(index, "an index of an export", (ValueError, KeyError, TypeError)):
         document = json.loads(index.read_bytes())
         for key, value in (("format", INDEX_FORMAT), ("layout", layout)):

@@ -13,6 +13,7 @@ from pydantic import PrivateAttr
 from lgrasp import __version__
 from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.exports.formats import read_grasps
+from lgrasp.dataset.exports.reading import objects_beside
 from lgrasp.dataset.info import closure_share
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import content_key
@@ -29,6 +30,7 @@ from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs
 from lgrasp.jobs.refine.moved import move_rows
 from lgrasp.jobs.requests.shards import RefineRequest
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
+from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.load import load_mesh
 from lgrasp.steer.touch import moved_rows
 
@@ -224,7 +226,8 @@ def _grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) ->
     for number, item in enumerate(found.objects):
         chosen = np.flatnonzero(rows.object_index[:, 0] == number)
         if item.mesh is None:
-            raise ShardError(f"{path}: no mesh of object '{item.code}' is known; an export folder with its meshes is")
+            wanted = f"{objects_beside(path) / item.code}.obj (or {', '.join(MESH_SUFFIXES[1:])})"
+            raise ShardError(f"{path}: no mesh of object '{item.code}'; {wanted} is looked for")
         if not (np.isfinite(item.scale) and item.scale > 0):
             raise ShardError(f"{path}: object '{item.code}' has scale {item.scale:g}; a positive number is accepted")
         mesh = load_mesh(item.mesh, scale=item.scale)
