@@ -57,10 +57,10 @@ def find_shards(paths: Paths) -> list[Path]:
         ShardError: A path does not exist, or no shard is left.
     """
     try:
-        return [file for file, _ in _found(paths, "*.h5")]
+        return [file for file, _ in _found(paths, deep=False)]
     except ShardError as error:
-        below = [folder for folder in folders_below(paths) if next(folder.glob("*.h5"), None)]
-        raise ShardError(f"{error}; name one of its folders, such as {below[0]}") if below else error from None
+        holding = [folder for folder in folders_below(paths) if next(folder.glob("*.h5"), None)]
+        raise ShardError(f"{error}; name one of its folders, such as {holding[0]}") if holding else error from None
 
 
 def shards_below(paths: Paths, leave_out: Path | None = None) -> list[tuple[Path, Path]]:
@@ -73,13 +73,42 @@ def shards_below(paths: Paths, leave_out: Path | None = None) -> list[tuple[Path
     Raises:
         ShardError: A path does not exist, or no shard is left.
     """
-    return list({file.absolute(): (file, folder) for file, folder in _found(paths, "**/*.h5", leave_out)}.values())
+    return list({file.absolute(): (file, folder) for file, folder in _found(paths, leave_out)}.values())
 
 
-def folders_below(paths: Paths, pattern: str = "**/*.h5") -> list[Path]:
-    """The folders among some paths, and those below them that hold shards, which the pattern matches."""
+def folders_below(paths: Paths, *, deep: bool = True) -> list[Path]:
+    """The folders among some paths, and, of any depth, those below them that hold shards."""
     tops = [path for path in _given(paths) if path.is_dir()]
-    return list(dict.fromkeys(f for top in tops for f in (top, *sorted({s.parent for s in top.glob(pattern)}))))
+    return list(dict.fromkeys(f for t in tops for f in (t, *sorted({s.parent for s in _inside(t, deep=deep)}))))
+
+
+def walk(top: Path, *, hidden: bool = True) -> Iterator[tuple[Path, list[str]]]:
+    """A folder and those below it, each once, with the names of their files. Links to folders elsewhere are followed.
+
+    Args:
+        hidden: Folders too whose names begin with a dot.
+    """
+    real, seen = top.resolve(), set()
+
+    def is_new(folder: Path) -> bool:
+        target = folder.resolve()
+        return not folder.is_symlink() or not (target.is_relative_to(real) or real.is_relative_to(target))
+
+    for name, below, files in os.walk(top, followlinks=True):
+        here = Path(name)
+        if (place := here.resolve()) in seen:
+            below.clear()
+            continue
+        seen.add(place)
+        below[:] = sorted(f for f in below if (hidden or not f.startswith(".")) and is_new(here / f))
+        yield here, files
+
+
+def _inside(folder: Path, *, deep: bool) -> list[Path]:
+    """The shard files in a folder, sorted."""
+    if not deep:
+        return sorted(folder.glob("*.h5"))
+    return sorted(here / name for here, names in walk(folder) for name in names if name.endswith(".h5"))
 
 
 def named_files(paths: Paths) -> list[Path]:
@@ -98,7 +127,7 @@ def _given(paths: Paths) -> list[Path]:
     return [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
 
 
-def _found(paths: Paths, pattern: str, leave_out: Path | None = None) -> list[tuple[Path, Path]]:
+def _found(paths: Paths, leave_out: Path | None = None, *, deep: bool = True) -> list[tuple[Path, Path]]:
     """Shard files with the folders that were named; with its own for a file that was named."""
     given = _given(paths)
     found: list[tuple[Path, Path]] = []
@@ -107,7 +136,7 @@ def _found(paths: Paths, pattern: str, leave_out: Path | None = None) -> list[tu
             raise ShardError(f"{path}: no such file or folder")
         if not path.is_dir():
             check_regular(path)
-        found += [(file, path) for file in sorted(path.glob(pattern))] if path.is_dir() else [(path, path.parent)]
+        found += [(file, path) for file in _inside(path, deep=deep)] if path.is_dir() else [(path, path.parent)]
     if leave_out is not None:
         found = [(file, top) for file, top in found if not file.resolve().is_relative_to(leave_out.resolve())]
     if not found:

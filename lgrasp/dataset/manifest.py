@@ -347,7 +347,7 @@ def check_files(paths: Paths, check: Callable[[Path], list[str]], *, below: bool
     """
     files = [path for path, _ in shards_below(paths)] if below else find_shards(paths)
     problems = {str(path): check(path) for path in files}
-    for folder in folders_below(paths, "**/*.h5" if below else "*.h5"):
+    for folder in folders_below(paths, deep=below):
         path = folder / MANIFEST
         try:
             found = compare_folder(folder)

@@ -1,11 +1,11 @@
 """How far the runs are whose files are in some folders, by their manifests."""
 
-import os
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from lgrasp.dataset.files import walk
 from lgrasp.dataset.manifest import (
     MANIFEST,
     SUFFIX,
@@ -59,10 +59,9 @@ def folder_states(paths: Iterable[Path], *, verify: bool = False) -> list[dict[s
 
 def _folders(top: Path) -> Iterator[Path]:
     """Folders with a manifest or shards; hidden ones are left out."""
-    for name, below, files in os.walk(top):
-        below[:] = sorted(folder for folder in below if not folder.startswith("."))
+    for folder, files in walk(top, hidden=False):
         if any(file == MANIFEST or file.endswith(SUFFIX) for file in files):
-            yield Path(name)
+            yield folder
 
 
 def _states(folder: Path, working: Any, verify: bool) -> list[dict[str, Any]]:

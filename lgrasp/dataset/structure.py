@@ -29,12 +29,15 @@ _EXPANSION = 2000  # declared over stored bytes; the compression of HDF5 ends at
 
 def format_problems(file: h5py.File, name: str, form: str, version: str) -> list[str]:
     """Why a file is no whole file of a version that this package reads, in one line; empty when it is."""
-    attrs, major = file.attrs, version.partition(".")[0]
+    attrs, major = file.attrs, int(version.partition(".")[0])
     if attrs.get("format") != form:
         return [f"not a {name} (attribute format is {attrs.get('format')!r}, expected {form!r})"]
-    found = str(attrs.get("format_version"))
-    if not re.fullmatch(rf"{major}\.\d+", found):
-        return [f"format_version is {found!r}, this lgrasp reads {major}.x; use a newer lgrasp"]
+    found = str(attrs.get("format_version", ""))
+    numbers = re.fullmatch(r"([0-9]{1,9})\.[0-9]+", found)
+    if not numbers or int(numbers[1]) != major:
+        newer = numbers and int(numbers[1]) > major
+        why = "use a newer lgrasp" if newer else "no lgrasp wrote this file, or it is damaged"
+        return [f"format_version is {found!r}, this lgrasp reads {major}.x; {why}"]
     if not np.array_equal(attrs.get("complete"), 1):
         return [f"incomplete (attribute complete is {attrs.get('complete')!r}, expected 1)"]
     return []

@@ -1,12 +1,14 @@
 """Which shards a command works on: a folder may hold folders, files that cannot be used, and the same rows twice."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from support.shards import sample_shard
 
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.info import describe
+from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
@@ -27,6 +29,17 @@ def test_folders_of_folders(tmp_path, said):
     assert [shard.path for shard in gather([one, one, tmp_path / "top"])] == [one, two]
     assert len(GraspDataset(tmp_path / "top")) == 6
     assert said == []
+
+
+def test_links_to_folders_are_followed_once(tmp_path):
+    inside = write(tmp_path / "top" / "mug" / "0.h5", 0)
+    outside = write(tmp_path / "disk" / "bowl" / "0.h5", 1)
+    for link, to in (("a", "top/mug"), ("b", "disk"), ("c", "."), ("mug/d", "disk"), ("../disk/e", "disk")):
+        (tmp_path / "top" / link).symlink_to(tmp_path / to)
+    found = [shard.path for shard in gather(tmp_path / "top")]
+    assert found == [tmp_path / "top" / "b" / "bowl" / "0.h5", inside]
+    assert found[0].samefile(outside)
+    assert {Path(state["folder"]) for state in folder_states([tmp_path / "top"])} == {path.parent for path in found}
 
 
 def test_what_cannot_be_used_is_left_out(tmp_path, said):
