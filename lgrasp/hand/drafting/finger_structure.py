@@ -160,18 +160,21 @@ _FINGER_WORDS = {
     "ring": ("ring", "rf_", "_rf", "rfj", "rfd"),
     "little": ("little", "pinky", "lf_", "_lf", "lfj", "lfd"),
 }
+_LEFT_RIGHT = ("rf", "lf")  # of hands of two fingers
 
 
 def finger_names(structure: FingerStructure) -> list[str]:
     """A name for each dependency group, from its links and joints where they say which finger it is."""
     names: list[str] = []
+    few = structure.tree.groups <= 2
+    words = {w: [k for k in keys if not (few and k.strip("_jd") in _LEFT_RIGHT)] for w, keys in _FINGER_WORDS.items()}
     for g in range(structure.tree.groups):
         bodies = np.flatnonzero(structure.tree.body_group == g).tolist()
         texts = [link for body in bodies for link in structure.tree.links_on(body)]
         texts += [joint for tip, drives in structure.drives.items() if tip in bodies for joint in drives]
         count = dict.fromkeys(_FINGER_WORDS, 0)
         for text in texts:
-            found = [word for word, keys in _FINGER_WORDS.items() if any(key in text.lower() for key in keys)]
+            found = [word for word, keys in words.items() if any(key in text.lower() for key in keys)]
             # a middle phalanx is no middle finger
             for word in [w for w in found if w != "middle"] or found:
                 count[word] += 1

@@ -1,5 +1,6 @@
 """Rules drafted from a URDF alone: grippers, coupled jaws, other base frames, left hands, and what is refused."""
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -91,9 +92,11 @@ def test_alike_fingers_touch_with_the_same_links(tmp_path):
 @pytest.mark.usefixtures("no_spaces")
 def test_prismatic_jaws_face_each_other(tmp_path):
     path = gripper(tmp_path)
+    path.write_text(re.sub('"jaw_(.)"', r'"\1f_jaw"', path.read_text()))
     spec, _ = draft_spec(path)
     model = build_hand(path, spec)
-    assert contact_links(spec) == {"jaw_l", "jaw_r"}
+    assert contact_links(spec) == {"lf_jaw", "rf_jaw"}
+    assert set(spec.fingers) == {"finger_1", "finger_2"}  # left and right, not little and ring
     middle = (model.tree.joint_lower + model.tree.joint_upper) / 2
     left, right = (placed_normals(model, middle, g).mean(0) for g in range(2))
     assert left[0] < -0.9
