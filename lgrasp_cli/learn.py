@@ -29,7 +29,11 @@ def fit(
         Option("--out", "-o", help="File of the network; default: coarse.pt, diffuser.pt, grasp.pt or policy.npz."),
     ] = None,
     steps: Annotated[
-        int | None, Option(help="Training steps; default: 1500 (coarse, on poses alone) or 20000.")
+        int | None,
+        Option(
+            help="Training steps; default: 1500 (coarse, on poses alone) or 20000. Before these a grasp network takes "
+            "3000 of grasp.completion_steps."
+        ),
     ] = None,
     joint_steps: Annotated[
         int | None, Option(help="Training steps through the refiner afterwards (coarse); default: 80.")
@@ -89,6 +93,12 @@ def fit(
     if pipeline:
         asked["pipeline"] = choose_pipeline(pipeline)
     chosen = given(steps=steps, joint_steps=joint_steps, unrolled=unrolled, batch=batch, seed=seed)
+    for name in chosen.keys() - kind.model_fields:
+        takers = ", ".join(other for other, (_, params, _) in kinds.items() if name in params.model_fields)
+        raise ConfigError(
+            f"learn fit: --{name.replace('_', '-')} is for --model {takers}; "
+            f"--set {model}.KEY=VALUE takes {', '.join(kind.model_fields)}"
+        )
     params = apply_settings({model: parse_model(kind, chosen, "learn fit")}, settings or (), "learn fit")[model]
     how.run(how.job(request, "learn fit", **asked, out=out, params=params), show)
 

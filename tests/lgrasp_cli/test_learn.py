@@ -66,6 +66,10 @@ def test_interrupted_before_there_is_anything_to_report(generate, cli, monkeypat
 
 
 def test_bad_options(cli):
+    line = cli("learn", "fit", "--model", "pose", "--steps", 5).error()
+    assert "--steps is for --model coarse, diffuser, grasp; --set pose.KEY=VALUE takes shapes, " in line
+    assert "epochs" in line
+    assert "--unrolled is for --model coarse;" in cli("learn", "fit", "x", "--model", "grasp", "--unrolled", 5).error()
     assert "no such file or folder" in cli("learn", "fit", "absent").error()
     for option, value in (("batch", 0), ("steps", -1), ("unrolled", 101), ("seed", -1)):
         assert f"key '{option}' = {value}" in cli("learn", "fit", "absent", f"--{option}", value).error()

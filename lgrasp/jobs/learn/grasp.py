@@ -48,7 +48,7 @@ class GraspJob(GraspRequest, NetworkJob):
         completes = CompletionNet(p.channels).to(alias)
         torch.random.set_rng_state(state)
         start = time.perf_counter()
-        solids = random_solids(p.seed, p.shapes, p.cloud, lambda made: progress(0, f"{made:,} solids"))
+        solids = random_solids(p.seed, p.shapes, p.cloud, lambda made: progress(0, f"{made:,} of {p.shapes:,} solids"))
         seconds["solids"] = time.perf_counter() - start
         start = time.perf_counter()
         completion = LossCurve(p.completion_steps, lambda step, loss: progress(step, f"loss {loss:.3f}"))
