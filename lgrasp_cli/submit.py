@@ -44,9 +44,11 @@ def submit(
     Example: lgrasp submit --tasks 10 --gpus 1 --time 2:00:00 -- generate --object mug -n 100000
     """
     from lgrasp.errors import ConfigError
+    from lgrasp.notices import notice
 
     words = words[1:] if words[0] == "lgrasp" else words
-    parts = _checked(context.find_root().command, words)
+    checked = _checked(context.find_root().command, words)
+    parts = sum(found for found, _ in checked)
     if parts < tasks:
         raise ConfigError(
             f"--tasks {tasks}: the command makes {plural(parts, 'file')}; give --tasks {parts} or fewer, or make "
@@ -54,6 +56,9 @@ def submit(
         )
     if gpus > 1 and not any(re.match("--device(=|$)", word) for word in words):
         words = [*words, "--device", "all"]
+    asked = re.findall(r"(?:^|\n)--device[=\n](.*)", "\n".join(words))[-1:] or [device for _, device in checked]
+    if gpus and {*asked} == {"cpu"}:
+        notice(f"--gpus {gpus}: the command runs on the CPU; leave --gpus out, or give the command another --device")
     name = name or f"lgrasp-{words[0]}"
     if not re.fullmatch(r"[\w.+-]+", name):
         raise ConfigError(f"--name '{name}' may hold letters, digits and '.', '_', '+', '-' only")
@@ -86,8 +91,9 @@ def submit(
     return Answer({"job": job, "tasks": tasks, "files": parts, "script": str(path), "logs": str(logs)}, [pairs])
 
 
-def _checked(program: Any, words: list[str]) -> int:
-    """How many files a command of the program makes; it is checked as far as can be told before anything is loaded.
+def _checked(program: Any, words: list[str]) -> list[tuple[int, str]]:
+    """Of each job of a command how many files it makes, and its own device; it is checked as far as can be told before
+    anything is loaded.
 
     Raises:
         LgraspError: an option, a name, a number or a path that cannot be.
@@ -108,9 +114,9 @@ def _checked(program: Any, words: list[str]) -> int:
             raise ConfigError(
                 f"{word} has no place in a command that is submitted; tasks share its files by themselves"
             )
-    with only_checked() as parts:
+    with only_checked() as found:
         program.main(args=words, prog_name="lgrasp", standalone_mode=False)
-    return sum(parts)
+    return found
 
 
 def _more(options: list[str]) -> dict[str, str]:

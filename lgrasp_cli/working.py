@@ -28,13 +28,14 @@ Show = Callable[[dict[str, Any]], Sequence[Block]]
 """What is shown of the report of a job."""
 
 
-_CHECKED: ContextVar[list[int] | None] = ContextVar("checked", default=None)
+_CHECKED: ContextVar[list[tuple[int, str]] | None] = ContextVar("checked", default=None)
 
 
 @contextmanager
-def only_checked() -> "Iterator[list[int]]":
-    """Commands check their jobs in the block and run none; numbers of parts of the jobs, once they are checked."""
-    found: list[int] = []
+def only_checked() -> "Iterator[list[tuple[int, str]]]":
+    """Commands check their jobs in the block and run none; number of parts of each job, and the device that it has
+    without an option, once they are checked."""
+    found: list[tuple[int, str]] = []
     token = _CHECKED.set(found)
     try:
         yield found
@@ -57,7 +58,7 @@ def merely_checked(requests: "Sequence[Request]", cache: "Cache") -> bool:
     for request in requests:
         request.check()
         job = request if isinstance(request, Job) else request.job(cache)
-        found.append(len(job.parts()))
+        found.append((len(job.parts()), job.device))
         check_folder(job.folder)
     return True
 

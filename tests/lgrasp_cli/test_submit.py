@@ -64,6 +64,13 @@ def test_tasks_of_several_gpus_use_them_all(cli, sbatch, tmp_path):
     assert os.listdir(tmp_path) == ["bin"]  # nothing was submitted, nothing written
 
 
+@pytest.mark.parametrize(("device", "told"), [(["--device", "cpu"], True), (["--device=cpu"], True), ([], False)])
+def test_a_gpu_for_a_command_on_the_cpu_is_told(cli, sbatch, device, told):
+    shown = cli("submit", "--gpus", 1, "--dry-run", "--", "generate", "--object", "tiny", "-n", 5, *device)
+    assert shown.code == 0
+    assert ("--gpus 1: the command runs on the CPU; leave --gpus out" in shown.err) == told
+
+
 WRONG = {
     "no command": (["hands", "list"], "'hands list' is no command that makes files"),
     "a typo": (["generate", "--object", "tinny"], "did you mean tiny?"),
