@@ -30,10 +30,7 @@ def fit(
     ] = None,
     steps: Annotated[
         int | None,
-        Option(
-            help="Training steps; default: 1500 (coarse, on poses alone) or 20000. Before these a grasp network takes "
-            "3000 of grasp.completion_steps."
-        ),
+        Option(help="Training steps; default: 1500 (coarse) or 20000; grasp: after grasp.completion_steps."),
     ] = None,
     joint_steps: Annotated[
         int | None, Option(help="Training steps through the refiner afterwards (coarse); default: 80.")
