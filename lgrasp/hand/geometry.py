@@ -1,11 +1,13 @@
 """Collision geometry -> convex pieces, inner spheres, surface samples and a triangle mesh per link."""
 
 import warnings
+from pathlib import Path
 
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
+from trimesh.units import unit_conversion
 
 from lgrasp.errors import DecomposeError, HandError, short_reason
 from lgrasp.geometry.clusters import one_per_cell
@@ -46,7 +48,7 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            mesh = trimesh.load_mesh(file, process=True)
+            mesh = read_mesh(file)
     except Exception as error:  # any parser error means the same to the user
         raise HandError(f"URDF {urdf.path}: mesh {file} cannot be read: {short_reason(error)}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
@@ -58,6 +60,15 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
             f"URDF {urdf.path}: mesh {file} is {mesh.extents.max():.3g} m wide; the file is probably in millimetres, "
             'add scale="0.001 0.001 0.001" to its <mesh>'
         )
+    return mesh
+
+
+def read_mesh(file: Path) -> trimesh.Trimesh:
+    """The mesh of a file as it is without a scale: in metres where a file of COLLADA states its unit, as other tools
+    read it."""
+    mesh = trimesh.load_mesh(file, process=True)
+    if file.suffix.lower() == ".dae" and mesh.units:
+        mesh.apply_scale(unit_conversion(mesh.units, "meters"))
     return mesh
 
 

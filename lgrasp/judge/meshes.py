@@ -10,6 +10,7 @@ import trimesh
 from scipy.ndimage import label
 from scipy.spatial import QhullError, cKDTree
 from scipy.spatial.transform import Rotation
+from trimesh.units import unit_conversion
 
 TESTS = 400_000  # points x triangles tested at once
 PAIRS = 1_000_000  # points x boxes held at once
@@ -304,6 +305,7 @@ def mass_centre(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def load_mesh(source: Path | bytes, name: str) -> trimesh.Trimesh:
-    """Mesh of a file or of its bytes; all parts of a scene in one."""
-    file = io.BytesIO(source) if isinstance(source, bytes) else str(source)
-    return trimesh.load_scene(file, file_type=Path(name).suffix.lstrip(".").lower()).to_mesh()
+    """Mesh of a file or of its bytes; all parts of a scene in one, of COLLADA in metres."""
+    file, kind = io.BytesIO(source) if isinstance(source, bytes) else str(source), Path(name).suffix.lstrip(".").lower()
+    mesh = trimesh.load_scene(file, file_type=kind).to_mesh()
+    return mesh.apply_scale(unit_conversion(mesh.units, "meters")) if kind == "dae" and mesh.units else mesh

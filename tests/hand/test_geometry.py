@@ -1,10 +1,11 @@
-"""Points on a link's surface."""
+"""Meshes of links, and points on their surface."""
 
 import numpy as np
 import trimesh
 from scipy.spatial import KDTree
 
-from lgrasp.hand.geometry import surface_samples
+from lgrasp.hand.geometry import read_mesh, surface_samples
+from lgrasp.judge.meshes import load_mesh
 
 SPACING = 0.004
 
@@ -18,3 +19,13 @@ def test_samples_lie_along_the_edges_of_a_box():
         edge = np.tile(half, (200, 1))
         edge[:, axis] = np.linspace(-half[axis], half[axis], 200)
         assert KDTree(on_edge).query(edge)[0].max() <= SPACING
+
+
+def test_units_of_collada_files_count(tmp_path):
+    """For the hand and for the judge of its grasps; a file that states none is in metres."""
+    file = tmp_path / "box.dae"
+    text = trimesh.creation.box((8.0, 16.0, 24.0)).export(file_type="dae").decode()
+    for unit, metres in (('<unit name="inch" meter="0.0254"/>', 0.0254), ('<unit meter="1"/>', 1.0), ("", 1.0)):
+        file.write_text(text.replace("</asset>", f"{unit}</asset>"))
+        for mesh in (read_mesh(file), load_mesh(file, file.name), load_mesh(file.read_bytes(), file.name)):
+            np.testing.assert_allclose(mesh.extents, metres * np.array([8.0, 16.0, 24.0]), rtol=1e-6)

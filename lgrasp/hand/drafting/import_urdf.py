@@ -25,7 +25,7 @@ from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.mjcf import mjcf_to_urdf
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
-from lgrasp.hand.geometry import MOST_FACES, thin_mesh
+from lgrasp.hand.geometry import MOST_FACES, read_mesh, thin_mesh
 from lgrasp.hand.names import name_of_file, slug
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
 from lgrasp.hand.urdf import check_robot, find_mesh, is_mjcf, read_robot
@@ -238,7 +238,7 @@ def _rewritten(file: Path, *, huge: bool) -> trimesh.Trimesh | None:
         return None
     try:
         mesh_bytes(file)  # refuses files outside the mesh's folder
-        mesh = trimesh.load_mesh(file, process=True)
+        mesh = read_mesh(file)
     except Exception:
         return None
     return mesh if isinstance(mesh, trimesh.Trimesh) and (several or len(mesh.faces) > MOST_FACES) else None
