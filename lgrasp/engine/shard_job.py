@@ -89,9 +89,9 @@ class ShardJob(ShardRequest, Job):
                 raise ShardError(f"{part.source}: its rows were replaced while they were worked on; run it again")
             extend_shard(part.source, part.file, **added)
 
-    def marked(self, part: Part, shard: Shard, statistics: Mapping[str, int | float | str]) -> Shard:
-        """The shard with more statistics, and what tells that it is this part of this job."""
-        return replace(shard, statistics={**shard.statistics, **statistics, MADE_FROM: self.part_key(part)})
+    def marked(self, shard: Shard, key: str, statistics: Mapping[str, int | float | str]) -> Shard:
+        """The shard with more statistics, and the :meth:`part_key` that tells what it was made from."""
+        return replace(shard, statistics={**shard.statistics, **statistics, MADE_FROM: key})
 
 
 def rows_digest(reader: ShardReader, more: Sequence[str] = ()) -> str:

@@ -19,13 +19,14 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run
-from lgrasp.errors import ShardError
+from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.records import GraspRows, Shard
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.hold.run import METRICS
 from lgrasp.jobs.generate import GenerateJob, generate
-from lgrasp.jobs.refine.shards import RefineJob
+from lgrasp.jobs.refine import shards
+from lgrasp.jobs.refine.shards import RefineJob, move_rows
 from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.judge.run import judge
 from lgrasp.simulate.protocol import find_protocol
@@ -242,6 +243,29 @@ def test_shards_without_rows_are_left_out(source, cache_root, tmp_path):
         run(RefineJob(shards=(tmp_path / "none.h5",), **given))
     assert not told
     assert not (tmp_path / "out").exists()
+
+
+def test_a_source_that_is_replaced_meanwhile(source, cache_root, tmp_path, monkeypatch):
+    """What was made of its old rows is not taken for what the new ones give."""
+    path, shard = tmp_path / "in.h5", read_shard(source)
+    before, after = (
+        replace(
+            shard.grasps, **{name: getattr(shard.grasps, name)[rows] for name in GRASP_FIELDS}, metrics={}, physics={}
+        )
+        for rows in (slice(1, 3), slice(3, 5))
+    )
+    write_shard(path, replace(shard, grasps=before))
+
+    def replacing(*args, **options):
+        write_shard(path, replace(shard, grasps=after))
+        return move_rows(*args, **options)
+
+    monkeypatch.setattr(shards, "move_rows", replacing)
+    given: dict[str, Any] = {"params": RefineParams(matching_rounds=0), "device": "cpu", "cache": Cache(cache_root)}
+    refined = RefineJob(shards=(path,), out=tmp_path / "out", **given)
+    run(refined)
+    with pytest.raises(OutputError, match="belongs to another run"):
+        run(refined.changed())
 
 
 def test_a_shard_of_which_no_row_passes_is_empty_and_stays(job, cache_root, tmp_path):

@@ -94,6 +94,7 @@ class RefineJob(RefineRequest, ShardJob):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
+        key = self.part_key(part)  # now: another process may replace the source later
         shard = read_shard(part.source) if self.form is None else self._given[part.number]
         if not len(shard.grasps):
             self.cache.warn(f"{part.source} holds no grasps; it is left out")
@@ -144,7 +145,7 @@ class RefineJob(RefineRequest, ShardJob):
         # contacts are found anew, wherever they are
         objects = [replace(record, regions=None, touch_share=1.0) for record in shard.objects]
         refined = replace(shard, header=header, objects=objects, grasps=moved.rows)
-        return Made(len(moved.rows), self.marked(part, refined, counts))
+        return Made(len(moved.rows), self.marked(refined, key, counts))
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``results``: of each shard hand, object, ``points`` (it is a cloud), rows, refined, valid before and after,
