@@ -244,8 +244,9 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
         first, key = first_problem(error)
         if first["type"] == "extra_forbidden":
             name, valid = str(first["loc"][-1]), _keys_at(model, first["loc"][:-1])
-            meant = _AS_OPTIONS.get(name)
-            hint = did_you_mean(meant if meant in valid else name, valid)
+            within = next((k for k in valid if name in _keys_at(model, (*first["loc"][:-1], k))), None)
+            meant = _AS_OPTIONS.get(name, name)
+            hint = f"it is a key of '{within}'; " if within else did_you_mean(meant if meant in valid else name, valid)
             raise ConfigError(f"{where}: unknown key '{key}'; {hint}valid keys: {', '.join(valid)}") from None
         if first["type"] == "missing":
             raise ConfigError(f"{where}: key '{key}' is missing") from None

@@ -192,6 +192,8 @@ def test_run_on_several_devices(cli, tmp_path, monkeypatch):
         ("object: [tiny]", "did you mean 'objects'"),
         ("objects: [tiny]\nn: 5", "did you mean 'rows'"),
         ("objects: [tiny]\nset: []", "did you mean 'settings'"),
+        ("objects: [tiny]\nfingers: [thumb]", "it is a key of 'steer'"),
+        ("job: learn\nshards: [x]\nsteps: 3", "it is a key of 'params'"),
         ("objects: []", "objects"),
         ("objects: tiny", "key 'objects' = 'tiny': give a list: [tiny]"),
         ("objects: [tiny]\nrows: 0", "rows"),
