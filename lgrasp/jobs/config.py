@@ -27,7 +27,7 @@ from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.request import Request, named
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
-from lgrasp.hand.names import all_hands, known_hands
+from lgrasp.hand.names import all_hands, hand_path, known_hands
 from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest
 from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
 from lgrasp.notices import notice
@@ -253,7 +253,8 @@ def hand_name(hand: str) -> str:
     """
     if hand in known_hands():  # one of the catalogue is called by its folder
         return hand
-    from lgrasp.jobs.hands import hand_source  # slow to load
+    hand_path(hand)
+    from lgrasp.jobs.hands import hand_source  # slow to load: only for what is there
 
     return hand_source(hand).name
 

@@ -150,7 +150,7 @@ def test_the_real_urdf_finds_its_rules(name):
     real(name)  # skips when absent
     for path in {REAL[name], ASSETS / name / f"{name}.urdf"}:
         source = find_hand(str(path))
-        assert (source.name, source.urdf) == (name, path)
+        assert (source.known, source.name, source.urdf) == (name, path.stem, path)
         tree = build_tree(read_urdf(path), source.spec)
         assert tree.groups == HANDS[name][2]
 
