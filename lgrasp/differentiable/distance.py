@@ -25,6 +25,11 @@ class _Cells(NamedTuple):
 _Three = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
+def _node(whole: torch.Tensor) -> torch.Tensor:
+    """Whole numbers as indices; 0 for NaN, whose shares in the cell are NaN."""
+    return whole.nan_to_num().to(torch.int64)
+
+
 def _in_cells(cells: _Cells, p: _Three) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """Points in cells of their grid, and the nearest ones that are in it."""
     u = [(x - o) * cells.inv_cell for x, o in zip(p, cells.origin, strict=True)]
@@ -36,7 +41,7 @@ def _corners(
 ) -> tuple[list[torch.Tensor], list[tuple[torch.Tensor, torch.Tensor]]]:
     """Shares (x, y, z) of points in a cell, and the values at its corners: pairs along z, for y, for x."""
     whole = [x.detach().floor() for x in c]
-    i, j, k = (x.to(torch.int64) for x in whole)
+    i, j, k = map(_node, whole)
     sx, sy = cells.stride
     a = cells.first + i * sx + j * sy + k
     edges = [a, a + sy, a + sx, a + sx + sy]
@@ -185,7 +190,7 @@ class SurfaceNormals:
         c = u.clamp_min(0).minimum(self._top)
         whole = c.detach().floor()
         f = (c - whole)[..., None, :]  # (..., 1, 3)
-        at = ((whole.to(torch.int64)[..., None, :] + self._corners) * self._stride).sum(-1)  # (..., 8)
+        at = ((_node(whole)[..., None, :] + self._corners) * self._stride).sum(-1)  # (..., 8)
         w = torch.where(self._corners == 1, f, 1 - f)
         w = w[..., 0] * w[..., 1] * w[..., 2]  # (..., 8)
         mixed = (self._slopes[at] * w[..., None]).sum(-2)  # (..., 4)

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from lgrasp.differentiable.kinematics import BodyKinematics
+from lgrasp.errors import ConfigError
 from lgrasp.geometry.rotations import inverse_motion, motion_from_pose, pose_from_motion, so3_exp
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
@@ -115,14 +116,18 @@ class Refiner(nn.Module):
     def forward(
         self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, rounds: int | None = None, first: int = 0
     ) -> Refined:
-        """Refine hands: match and take ``gradient_steps`` steps, in rounds ``first`` to ``rounds``.
+        """Refine hands: match and take ``gradient_steps`` steps, in rounds ``first`` to ``rounds``; NaN stay NaN.
 
         Args:
             rounds: default: the parameters' ``matching_rounds``. Sizes and reach fall along these or the parameters'
                 rounds, whichever are more.
             R: rotations of the hand's base in the object's internal frame, (N, 3, 3). t: its origin [m], (N, 3).
             q: joint positions [rad or m], (N, K); outside the limits they are clamped first.
+
+        Raises:
+            ConfigError: here and below, tensors of other shapes than these, or of another type than the refiner's.
         """
+        self._check(R, t, q)
         with torch.no_grad():
             given, fast = Pose(R.detach(), t.detach(), self._clamped(q.detach())), self.search
 
@@ -135,11 +140,13 @@ class Refiner(nn.Module):
             parts = zip(*(x.chunk(workers) for x in given), strict=True)
             with ThreadPoolExecutor(workers) as pool:
                 found = list(pool.map(search, [Pose(*part) for part in parts]))
-            pose = Pose(*(torch.cat(x) for x in zip(*found, strict=True)))
+            lost = torch.cat([x.flatten(1) for x in given], 1).sum(1) * 0  # NaN of hands that have one
+            pose = Pose(*(torch.cat(x) + lost.reshape(-1, *(1,) * (x[0].ndim - 1)) for x in zip(*found, strict=True)))
             return Refined(pose, self.energy(*pose))
 
     def max_penetration(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Depth of the deepest point of hands in anything, or of that in them [m], negative apart, (N,)."""
+        self._check(R, t, q)
         with torch.no_grad():
             return torch.as_tensor(self.search.max_penetration(self._put(Pose(R, t, q))), device=self._device)
 
@@ -153,6 +160,14 @@ class Refiner(nn.Module):
                 upload_hand(self._hand, name), target, self.params, self._surface, self._links.solids
             )
         return self._descent
+
+    def _check(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> None:
+        """Refuse what is no hands of this refiner; nothing is read from the device."""
+        n = len(t) if np.ndim(t) else 0
+        for name, x, shape in (("R", R, (n, 3, 3)), ("t", t, (n, 3)), ("q", q, (n, len(self.lower)))):
+            given = f"{tuple(x.shape)} of {x.dtype}" if isinstance(x, torch.Tensor) else type(x).__name__
+            if given != (accepted := f"{shape} of {self.lower.dtype}"):
+                raise ConfigError(f"{name} is {given}; of {n} hands a tensor {accepted} is accepted")
 
     def _put(self, pose: Pose) -> Hands:
         base = pose_from_motion(pose.R, pose.t)
@@ -173,6 +188,7 @@ class Refiner(nn.Module):
         Args:
             matches: default: those of the poses given.
         """
+        self._check(R, t, q)
         matches = matches or self.match(R, t, q)
         pose = Pose(R, t, q)
         for _ in range(steps):
@@ -185,6 +201,7 @@ class Refiner(nn.Module):
         Args:
             matches: default: those of these poses, with the parameters' first reach.
         """
+        self._check(R, t, q)
         matches = matches or self.match(R, t, q)
         bodies = self._bodies(q)
         x, m = self._placed(R, t, bodies)
@@ -201,6 +218,7 @@ class Refiner(nn.Module):
     @torch.no_grad()
     def match(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, reach: float | None = None) -> Matches:
         """Nearest points of the object for every point of the hands, and the contacts that make the net wrench."""
+        self._check(R, t, q)
         reach = self.params.reach if reach is None else reach
         bodies = self._bodies(q)
         x, _ = self._placed(R, t, bodies)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from lgrasp.errors import ConfigError
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps
@@ -103,6 +104,25 @@ def test_unrolled_steps_stay_rotations_and_lower_the_energy(make, valid, coarse)
     eye = torch.eye(3).expand(16, 3, 3)
     torch.testing.assert_close(moved.R @ moved.R.mT, eye, rtol=0, atol=1e-5)
     assert refiner.energy(*moved, matches=matches).total.mean() < refiner.energy(*pose, matches=matches).total.mean()
+
+
+def test_hands_that_are_none(make, valid):
+    """A hand with NaN stays NaN and alone; other shapes and types are refused in one line."""
+    refiner, pose = make(matching_rounds=2), some(valid, slice(4))
+    use = (lambda *x: refiner(*x).pose.t, lambda *x: refiner.energy(*x).total, lambda *x: refiner.unrolled(*x).t)
+    for given in (pose._replace(t=pose.t.clone()), pose._replace(q=pose.q.clone())):
+        given[1 if given.t is not pose.t else 2][1, 0] = torch.nan
+        for f in use:
+            right, found = f(*pose), f(*given)
+            assert found[1].isnan().all()
+            torch.testing.assert_close(found[[0, 2, 3]], right[[0, 2, 3]])
+    R, t, q = pose
+    for wrong in ((R.double(), t.double(), q.double()), (R, t, q[:, :5]), (R[0], t[0], q[0]), (R, t[:1], q), (R, t, 0)):
+        for f in (*use, refiner.match, refiner.max_penetration):
+            with pytest.raises(
+                ConfigError, match=r"^[Rtq] is .*; of \d hands a tensor \(\d.* of torch.float32 is accepted"
+            ):
+                f(*wrong)
 
 
 def test_joints_stay_in_their_limits(make, valid):
