@@ -80,7 +80,7 @@ def test_couplings_of_the_known_hand_fill_gaps(tmp_path):
     bare = tmp_path / "bare.urdf"
     bare.write_text(text)
     source = find_hand(str(bare))
-    assert source.name == "barrett"
+    assert source.known == "barrett"
     assert "couplings" in source.note
     coupling = source.spec.mimic["finger_2_prox_joint"]
     assert (coupling.joint, coupling.multiplier) == ("finger_1_prox_joint", -1.0)
