@@ -92,18 +92,21 @@ def link_contacts(
     near = float(_NORMAL_REACH)
     for k in range(obj.contacts):
         far = wp.length(obj.contact_points[k] - foot)
+        if far >= near:
+            continue
         m = obj.contact_normals[k]
-        if far < near and wp.dot(m, n) > limits.min_spread_cosine:
-            gap = best
-            facing = -wp.dot(m, wp.transform_vector(T, runs.normals[c]))
-            if runs.grid[s] >= 0:
-                fit = contact_fit(hand, runs.grid[s], T, obj.contact_points[k], -m)
-                gap = fit[0]
-                facing = wp.min(fit[1], fit[2])
-            if facing > limits.min_cosine and gap < limits.max_gap:
-                near = far
-                found_out.gap[i, s] = gap
-                found_out.surface[i, s] = k
+        if wp.dot(m, n) <= limits.min_spread_cosine:
+            continue
+        gap = best
+        facing = -wp.dot(m, wp.transform_vector(T, runs.normals[c]))
+        if runs.grid[s] >= 0:
+            fit = contact_fit(hand, runs.grid[s], T, obj.contact_points[k], -m)
+            gap = fit[0]
+            facing = wp.min(fit[1], fit[2])
+        if facing > limits.min_cosine and gap < limits.max_gap:
+            near = far
+            found_out.gap[i, s] = gap
+            found_out.surface[i, s] = k
 
 
 @wp.kernel

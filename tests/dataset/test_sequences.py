@@ -226,7 +226,7 @@ def test_parents_in_other_blocks(tmp_path, make_sequence, monkeypatch):
 def test_merge_needs_the_same_spaces(tmp_path, make_sequence):
     write_shard(tmp_path / "0.h5", make_sequence((3,)))
     write_shard(tmp_path / "1.h5", make_sequence((3,), shard_index=1, spaces=3))
-    with pytest.raises(ShardError, match=r"1\.h5: opposition spaces .* differs from"):
+    with pytest.raises(ShardError, match=r"1\.h5: opposition spaces differs from"):
         merge_shards(tmp_path, tmp_path / "all.h5")
 
 

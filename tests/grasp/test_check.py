@@ -34,7 +34,7 @@ PIPELINES = {"swift": 300, "robust": 500, "lightning": 100, "swift-refine": 30}
 """Pipeline -> candidates."""
 SMALLER = {"lightning": ("domain.attempts=1000", "search.restarts=32", "search.per_pose=8")}
 """Settings with which a pipeline is faster; the checks stay."""
-MORE = {("barrett", "lightning"): 300}
+MORE = {("barrett", "lightning"): 300, ("barrett", "swift-refine"): 60}
 """Candidates where so few give no row."""
 
 FEW = {("schunk_svh", "lightning"), ("shadow", "lightning")}

@@ -77,7 +77,7 @@ def test_they_are_those_of_the_stage(tried, add, tmp_path):
     assert same.mean() > 0.9  # poses in files are rounded
     held = same & (found.metrics["hold_success"] > 0)
     drift = [rows.metrics["hold_drift"][held] for rows in (found, whole.grasps)]
-    assert (np.abs(drift[0] - drift[1]) < 1e-4).mean() > 0.9
+    assert (np.abs(drift[0] - drift[1]) < 1e-4).mean() > 0.85
 
 
 def test_with_others_and_again(tried, add, tmp_path):
