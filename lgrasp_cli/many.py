@@ -33,7 +33,7 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
             if results[-1]["exit_code"] == 130:
                 break
     code = max(result["exit_code"] for result in results)
-    columns = ("job", "what", "requested", "present", "wall s", "strict/s", "status")
+    columns = ("job", "what", "requested", "rows", "wall s", "strict/s", "status")
     table = TextTable(columns, map(_row, results), right=columns[2:6])
     print_report({"jobs": results, "exit_code": code}, how.json_path, () if how.quiet else [table])
     if code:

@@ -11,6 +11,7 @@ _STEPS = (
     ("ik", "tried", "kept", "fingers cannot put their contact surface on the object without hitting it"),
     ("close", "tried", "touching", "fingers do not touch the object as they close, or with an edge"),
     ("search", "poses", "yielding", "the contacts within reach do not balance, or the fingers would hit each other"),
+    ("adjust", "tried", "kept", "fingers cannot make all contacts of a set, also where the object is moved a little"),
     ("filter", "", "kept", "finished grasps collide"),
     ("hold", "tried", "held", "grasps lose the object when it is pulled"),
     ("simulate", "tried", "held", "grasps lose the object in the physics simulation"),
@@ -26,10 +27,10 @@ def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
     worst, least, words = "place", 2.0, "nothing was tried"
     for stage, before, after, reason in _STEPS:
         found = counts.get(stage)
-        if not found:
+        whole = (found.get(before, 0) if before else sum(found.values())) if found else 0
+        if not found or not whole:
             continue
-        whole = found.get(before, 0) if before else sum(found.values())
-        share = found.get(after, 0) / whole if whole else 0.0
+        share = found.get(after, 0) / whole
         if 2 * found.get("touch", 0) > whole:
             reason = (
                 "too little of the normal force is on the region to touch; a smaller share or larger region gives more"

@@ -176,6 +176,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
     hands = [_urdf_in_folder(config.hand_dir, hand) for hand in all_hands(config.hands)]
     shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
     found: list[Request] = []
+    takers: dict[Path, str] = {}
     for pipeline in _pipelines(config):
         if not sets:
             meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
@@ -193,7 +194,10 @@ def plan_requests(config: JobConfig) -> list[Request]:
         }
         for hand, names in itertools.product(hands, drawn):
             meshes = tuple(in_folder(config.object_dir, mesh) for mesh in names)
-            out = run_folder(config.out, Path(hand).stem, sequence_name(names), pipeline.name, sets.simulate)
+            called = _names(hand, meshes[0])[0]
+            out = run_folder(config.out, called, sequence_name(names), pipeline.name, sets.simulate)
+            if (other := takers.setdefault(out, hand)) != hand:
+                raise ConfigError(_one_folder(other, hand, out))
             found.append(SequenceRequest(**shared | what, hand=hand, objects=meshes, pipeline=own, out=out))
     return found
 
@@ -223,12 +227,15 @@ def pair_requests(
         what = {"hand": hand, "object": mesh, "pipeline": pipeline, "out": out}
         request = parse_model(GenerateRequest, what | shared, "generate")
         if other := found.get(out):
-            raise ConfigError(
-                f"{other.hand} with {other.object} and {hand} with {mesh} have one folder, {out}; name one otherwise: "
-                "rename its file, or change 'name' in its hand.yaml"
-            )
+            raise ConfigError(_one_folder(f"{other.hand} with {other.object}", f"{hand} with {mesh}", out))
         found[out] = request
     return list(found.values())
+
+
+def _one_folder(first: str, second: str, out: Path) -> str:
+    """Why two jobs cannot be made together."""
+    how = "name one otherwise: rename its file, or change 'name' in its hand.yaml"
+    return f"{first} and {second} have one folder, {out}; {how}"
 
 
 def _names(hand: str, mesh: str) -> tuple[str, str]:

@@ -140,7 +140,9 @@ def check_network_hand(path: Path, hand: str, sha256: str, asked: str, digest: s
         ConfigError: it is.
     """
     if sha256 != digest:
-        raise ConfigError(f"{path} is of hand '{hand}', {words} '{asked}' (or of another model of it)")
+        other = "another model of it" if asked == hand else f"'{asked}'"
+        hint = "" if words == SHARDS else "; leave --hand out for its own, or train another: lgrasp learn fit"
+        raise ConfigError(f"{path} is of hand '{hand}', {words} {other}{hint}")
 
 
 def _card(path: Path) -> dict[str, Any]:

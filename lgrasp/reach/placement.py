@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Placement(Params):
-    """A pose; as text ``x,y,z``, ``x,y,z:yaw`` or ``x,y,z:roll,pitch,yaw``."""
+    """A pose; as text ``x,y,z``, ``x,y,z:yaw`` or ``x,y,z:roll,pitch,yaw``; as a list x, y, z."""
 
     position: Numbers = Field(description="x, y, z [m].")
     angles: Numbers = Field(
@@ -21,6 +21,8 @@ class Placement(Params):
     @model_validator(mode="before")
     @classmethod
     def _of_text(cls, value: Any) -> Any:
+        if isinstance(value, list | tuple):
+            return {"position": value}
         if not isinstance(value, str):
             return value
         position, colon, angles = value.partition(":")

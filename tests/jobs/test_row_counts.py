@@ -2,6 +2,7 @@
 
 from lgrasp.engine.events import JobOutcome
 from lgrasp.engine.report import job_report
+from lgrasp.jobs.bottleneck import starving_stage
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.runtime.device import resolve_device
 
@@ -26,3 +27,8 @@ def test_what_stops_a_job_is_told(small_job, tmp_path, monkeypatch):
         said = str(job.shortfall(few))
         assert said.startswith("20 of 60 grasps found; ")
         assert words in said
+
+
+def test_a_stage_that_nothing_reached_is_not_blamed():
+    counts = {"place": {"tried": 9, "kept": 9}, "adjust": {"tried": 5, "kept": 0}, "filter": {"kept": 0, "contact": 0}}
+    assert starving_stage(counts)[0] == "adjust"

@@ -48,6 +48,21 @@ def test_revisions_of_a_known_hand_are_called_as_their_files(cli, quick, tmp_pat
         assert plan.err.count(f"hand '{name}.urdf': rules (contacts, canonical box, open posture) of the known") == 1
 
 
+def test_sequences_are_in_folders_of_their_hands(cli, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        shutil.copy(find_hand("allegro").urdf, tmp_path / name / "hand.urdf")
+    sets = "sequences: {sets: 1, length: 2, permutations: 1}\n"
+    config = f"objects: [tiny, sphere]\nrows: 4\npipelines: [sequence]\n{sets}"
+    (tmp_path / "one.yaml").write_text(config + "hands: [a/hand.urdf]")
+    (tmp_path / "two.yaml").write_text(config + "hands: [a/hand.urdf, b/hand.urdf]")
+    plan = cli("run", "one.yaml", "--dry-run")
+    assert f"grasps/{find_hand(str(tmp_path / 'a' / 'hand.urdf')).name}-" in plan.out, plan
+    refused = cli("run", "two.yaml", "--dry-run")
+    assert refused.code == 2
+    assert "a/hand.urdf and b/hand.urdf have one folder" in refused.err.splitlines()[-1]
+
+
 def test_what_holds_nothing(cli, tmp_path):
     (tmp_path / "empty").mkdir()
     for name in ("empty", "*.obj"):

@@ -172,4 +172,7 @@ def test_networks_that_cannot_be_used(cli, small):
     Path("bad.pt").write_bytes(b"nonsense")
     assert "bad.pt: not a network" in cli("sample", "bad.pt", "mug", "sphere", "--device", "cpu").error()
     assert "needs diffuser" in cli("sample", "seq-allegro", "mug", "sphere", "-p", small).error()
-    assert "--joint-steps is for --model coarse" in cli("learn", "fit", "--model", "diffuser", "out", "--joint-steps", 3).error()
+    assert (
+        "--joint-steps is for --model coarse"
+        in cli("learn", "fit", "--model", "diffuser", "out", "--joint-steps", 3).error()
+    )
