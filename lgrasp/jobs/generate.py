@@ -27,7 +27,7 @@ from lgrasp.grasp.rows import grasp_rows
 from lgrasp.grasp.tables import take_grasps
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
-from lgrasp.jobs.hands import for_hand, hand_source, own_policy
+from lgrasp.jobs.hands import FEWEST_CONTACTS, for_hand, hand_source, own_policy
 from lgrasp.jobs.records import object_record
 from lgrasp.jobs.requests.search import GenerateRequest
 from lgrasp.jobs.row_counts import count_made, count_written
@@ -233,7 +233,9 @@ class GenerateJob(GenerateRequest, SearchJob):
                 f"'{self.keys.source.name}' has few more for {self.object_name} with pipeline {self.pipeline.name}"
             )
         stage, words = starving_stage(counts)
-        if stage in ("search", "hold") and self.pipeline.bounds.max_unresisted_load < _LOOSE_LOAD:
+        if stage in ("close", "search") and self.pipeline.bounds.min_contacts > FEWEST_CONTACTS:
+            words += "; grasps of fewer contacts: --pipeline robust"
+        elif stage in ("search", "hold") and self.pipeline.bounds.max_unresisted_load < _LOOSE_LOAD:
             words += f"; grasps that resist less: --set bounds.max_unresisted_load={_LOOSE_LOAD}, or --pipeline swift"
         untried = self.pipeline.params("place").policy is None and own_policy(self.pipeline, self.keys.source)
         if stage in ("search", "hold") and untried:

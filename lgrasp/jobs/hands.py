@@ -13,7 +13,8 @@ from lgrasp.policy.model import read_policy
 from lgrasp.policy.names import SHIPPED, shipped_policy
 from lgrasp.steer.typed import Anatomy, asked_sides, asked_thumb, made_types, typed
 
-_TWO = 2  # contacts that any grasp has
+FEWEST_CONTACTS = 2
+"""Contacts that any grasp has."""
 
 
 def hand_source(name: str) -> HandSource:
@@ -77,19 +78,19 @@ def _suited(pipeline: Pipeline, hand: str) -> Pipeline:
 
 
 def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:
-    least, asked = pipeline.bounds.min_contacts, _TWO
+    least, asked = pipeline.bounds.min_contacts, FEWEST_CONTACTS
     if "search" in pipeline.order:
         search = pipeline.params("search")
-        asked = _TWO if search.usual_contacts else min(search.contacts)
-    if max(least, asked) <= _TWO:
+        asked = FEWEST_CONTACTS if search.usual_contacts else min(search.contacts)
+    if max(least, asked) <= FEWEST_CONTACTS:
         return pipeline
     source = hand_source(hand)
     fingers, palm = build_tree(read_urdf(source.urdf), source.spec).groups, bool(source.spec.palm.links)
-    if asked > max(_TWO, fingers):
-        notice(f"hand '{source.name}': search.contacts is {max(_TWO, fingers)}, not {asked}: its fingers")
+    if asked > max(FEWEST_CONTACTS, fingers):
+        notice(f"hand '{source.name}': search.contacts is {max(FEWEST_CONTACTS, fingers)}, not {asked}: its fingers")
     if "close" in pipeline.order:  # each finger touches once
         fingers, palm = len(pipeline.steer.fingers) or fingers, palm and pipeline.steer.palm != "no"
-    most = max(_TWO, fingers + palm)
+    most = max(FEWEST_CONTACTS, fingers + palm)
     if least <= most:
         return pipeline
     notice(f"hand '{source.name}': bounds.min_contacts is {most}, not {least}: its fingers{' and palm' * palm}")
