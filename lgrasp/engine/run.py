@@ -149,10 +149,10 @@ class Job(Request, ABC):
 
     def replaced(self, every: Sequence[Part]) -> list[Path]:
         """Files of another run that has those of this one, beyond its last part."""
-        found = []
+        found, key = [], self.key()
         for path in neighbours([part.file for part in every]) if self.one_key else ():
             with suppress(ShardError, ValueError):
-                found += [path] if found_shard(path).key != self.key() else []
+                found += [path] if found_shard(path).key != key else []
         return found
 
     def clean(self, parts: Sequence[Part]) -> None:

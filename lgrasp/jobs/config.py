@@ -1,8 +1,9 @@
 """On what and where: default folders and configs/*.yaml."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -177,6 +178,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
     shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
     found: list[Request] = []
     takers: dict[Path, str] = {}
+    known_name = cache(hand_name)
     for pipeline in _pipelines(config):
         if not sets:
             meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
@@ -194,7 +196,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
         }
         for hand, names in itertools.product(hands, drawn):
             meshes = tuple(in_folder(config.object_dir, mesh) for mesh in names)
-            called = _names(hand, meshes[0])[0]
+            called = _names(hand, meshes[0], known_name)[0]
             out = run_folder(config.out, called, sequence_name(names), pipeline.name, sets.simulate)
             if (other := takers.setdefault(out, hand)) != hand:
                 raise ConfigError(_one_folder(other, hand, out))
@@ -220,10 +222,11 @@ def pair_requests(
         ConfigError: a value out of range, or two pairs with the same folder.
     """
     found: dict[Path, GenerateRequest] = {}
+    known_name = cache(hand_name)
     name = f"{pipeline.name}-table" if pipeline.params("place").table else pipeline.name
     name = f"{name}-steer-{pipeline.steer.tag}" if pipeline.steer.asks else name
     for hand, mesh in itertools.product(hands, objects):
-        out = run_folder(top, *_names(hand, mesh), name, protocol)
+        out = run_folder(top, *_names(hand, mesh, known_name), name, protocol)
         what = {"hand": hand, "object": mesh, "pipeline": pipeline, "out": out}
         request = parse_model(GenerateRequest, what | shared, "generate")
         if other := found.get(out):
@@ -238,12 +241,16 @@ def _one_folder(first: str, second: str, out: Path) -> str:
     return f"{first} and {second} have one folder, {out}; {how}"
 
 
-def _names(hand: str, mesh: str) -> tuple[str, str]:
-    """What a hand and an object are called in the names of folders; a job tells if there is no such thing."""
+def _names(hand: str, mesh: str, called: Callable[[str], str]) -> tuple[str, str]:
+    """What a hand and an object are called in the names of folders; a job tells if there is no such thing.
+
+    Args:
+        called: :func:`hand_name`, which reads files.
+    """
     names = Path(hand).stem, Path(mesh).stem
     with suppress(LgraspError):
         names = names[0], find_object(mesh).stem
-        names = hand_name(hand), names[1]
+        names = called(hand), names[1]
     return names
 
 

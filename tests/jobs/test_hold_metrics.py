@@ -19,7 +19,7 @@ from lgrasp.hold.run import METRICS
 from lgrasp.jobs.generate import GenerateJob, generate
 from lgrasp.jobs.metrics import MetricsJob
 
-ROWS = 15
+ROWS = 20
 
 
 class Watch(Events):
@@ -77,7 +77,7 @@ def test_they_are_those_of_the_stage(tried, add, tmp_path):
     assert same.mean() > 0.9  # poses in files are rounded
     held = same & (found.metrics["hold_success"] > 0)
     drift = [rows.metrics["hold_drift"][held] for rows in (found, whole.grasps)]
-    assert (np.abs(drift[0] - drift[1]) < 1e-4).mean() > 0.85
+    assert (np.abs(drift[0] - drift[1]) < 1e-4).mean() > 0.9
 
 
 def test_with_others_and_again(tried, add, tmp_path):
