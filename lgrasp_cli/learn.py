@@ -308,6 +308,8 @@ def _show_policy(data: dict[str, Any]) -> list[Block]:
         ("hand, objects", f"{data['hand']}; {data['objects']}, {data['held_out']} of them held out"),
         ("poses", f"{data['poses']:,}; {data['yielding']:,} gave grasps"),
     ]
+    shares = ", ".join(f"{name} {share:.1%}" for name, share in data["sources"].items())
+    pairs.append(("sources", f"{shares} of the poses to propose"))
     words = (("reach", "rated in place"), ("contacts", "after the first contacts"))
     for name, what in words:
         if data[name] is not None:

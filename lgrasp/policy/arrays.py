@@ -1,5 +1,6 @@
 """A pose policy on a device, as kernels of the stages read it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,17 +27,18 @@ class Network:
 
 @dataclass(frozen=True, eq=False)
 class PolicyArrays:
-    """The networks of a policy on one device; of no policy, without rows."""
+    """The networks of a policy on one device; of no policy, without rows. ``sources`` as of the policy."""
 
     reach: "Network"
     contacts: "Network"
+    sources: Mapping[str, float]
 
 
 def upload_policy(policy: PosePolicy | None, device: str) -> PolicyArrays:
     """Put a policy on a device; None rates nothing."""
     if policy is None:
         none = {"rows": np.zeros((0, WIDTH), np.float32), "points": np.zeros((0, 3), np.float32)}
-        return PolicyArrays(*(upload_struct(Network, device, none) for _ in range(2)))
+        return PolicyArrays(*(upload_struct(Network, device, none) for _ in range(2)), sources={})
     points = {"reach": policy.points, "contacts": policy.points[:0]}
     return PolicyArrays(
         **{
@@ -44,5 +46,6 @@ def upload_policy(policy: PosePolicy | None, device: str) -> PolicyArrays:
                 Network, device, {"rows": getattr(policy, name).rows, "groups": policy.groups, "points": at}
             )
             for name, at in points.items()
-        }
+        },
+        sources=policy.sources,
     )

@@ -1,4 +1,5 @@
-"""A pose policy: two small networks that tell how likely a pose is to give a grasp, and the file that keeps them."""
+"""A pose policy: two small networks that tell how likely a pose is to give a grasp, what each source of poses is worth,
+and the file that keeps them."""
 
 import io
 import json
@@ -51,6 +52,8 @@ class PosePolicy:
     """(M, 3) base frame [m]."""
     reach: Weights
     contacts: Weights
+    sources: dict[str, float] = field(default_factory=dict)
+    """Share of candidates that gave grasps where all poses came from one source of stage place, by its name."""
     about: dict[str, Any] = field(default_factory=dict)
     """How it was trained."""
 
@@ -76,6 +79,9 @@ def read_policy(path: str | Path) -> PosePolicy:
         if about.pop("format") != _FORMAT or about.pop("version") != _VERSION:
             raise ValueError("other format or version")
         points = arrays["points"].astype(np.float32)
+        sources = {str(name): float(share) for name, share in about.pop("sources", {}).items()}
+        if not all(0 < share <= 1 for share in sources.values()):
+            raise ValueError(f"shares of sources {sources}")
         made = PosePolicy(
             about.pop("hand"),
             tuple(about.pop("joints")),
@@ -83,6 +89,7 @@ def read_policy(path: str | Path) -> PosePolicy:
             points,
             Weights(arrays["reach"].astype(np.float32)),
             Weights(arrays["contacts"].astype(np.float32)),
+            sources,
             about,
         )
         for weights, count in ((made.reach, len(points)), (made.contacts, 0)):
@@ -102,8 +109,8 @@ def read_policy(path: str | Path) -> PosePolicy:
 def policy_bytes(policy: PosePolicy) -> bytes:
     """The file of a policy."""
     data = io.BytesIO()
-    about = {"format": _FORMAT, "version": _VERSION, "hand": policy.hand, "joints": list(policy.joints)}
-    about |= {"groups": policy.groups, **policy.about}
+    about: dict[str, Any] = {"format": _FORMAT, "version": _VERSION, "hand": policy.hand, "joints": list(policy.joints)}
+    about |= {"groups": policy.groups, "sources": policy.sources, **policy.about}
     arrays = {"points": policy.points, "reach": policy.reach.rows, "contacts": policy.contacts.rows}
     np.savez(
         data,

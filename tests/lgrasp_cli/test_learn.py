@@ -206,7 +206,10 @@ def test_a_pose_policy_is_trained_and_used(cli, tmp_path):
         assert done.code == 0, done
     assert Path("a.npz").read_bytes() == Path("b.npz").read_bytes()
     assert "--set place.policy=b.npz" in done.out
-    assert json.loads(Path("fit.json").read_text())["yielding"] > 16
+    report = json.loads(Path("fit.json").read_text())
+    assert report["yielding"] > 16
+    assert abs(sum(report["sources"].values()) - 1) < 1e-9
+    assert report["sources"]["pinch"] > report["sources"]["palm"] > 0  # a palm alone rarely has two fingers about it
     assert "contacts, loss" in cli("learn", "show", "b.npz").out
     use = ["generate", "--object", "tiny", "-n", 5, "--pipeline", pipeline, "--out", "rated", "--device", "cpu"]
     assert cli(*use, "--set", "place.policy=a.npz").code == 0

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lgrasp.engine.batch import run_stage
+from lgrasp.engine.batch import run_stage, run_stages
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.field.model import ContactField
 from lgrasp.geometry.poses import device_rotation
@@ -18,6 +18,7 @@ from lgrasp.runtime.fetch import to_numpy
 from lgrasp.runtime.tally import Meter
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.observe import Reach, observe_reach
+from lgrasp.stages.place.params import SOURCES
 
 _CPU_BATCH, _GPU_BATCH = 256, 16_384  # candidates
 _DRAW_STRIDE = 7919  # between the seeds of draws
@@ -51,6 +52,29 @@ def reach_points(field: ContactField, seed: int) -> np.ndarray:
     return kmeans2(every, POINTS, seed=seed, minit="++")[0].astype(np.float32)
 
 
+def source_yields(pipeline: Pipeline, context: Context, candidates: int) -> dict[str, int]:
+    """Of ``candidates`` whose poses come from one source of stage place alone, how many give a grasp; for each source
+    that has a weight."""
+    found = {}
+    for source in source_weights(pipeline):
+        alone = pipeline.with_params("place", **{name: float(name == source) for name in SOURCES})
+        rows = [run_stages(alone, context, *batch, "filter").index for batch in _batches(context, candidates)]
+        found[source] = len(np.unique(np.concatenate(rows)))
+    return found
+
+
+def source_weights(pipeline: Pipeline) -> dict[str, float]:
+    """Weights of the sources of stage place that have one."""
+    weights = {name: getattr(pipeline.params("place"), name) for name in SOURCES}
+    return {name: weight for name, weight in weights.items() if weight > 0}
+
+
+def _batches(context: Context, candidates: int) -> list[tuple[int, int]]:
+    """First candidate and number of each batch."""
+    most = _GPU_BATCH if context.device.startswith("cuda") else _CPU_BATCH
+    return [(first, min(most, candidates - first)) for first in range(0, candidates, most)]
+
+
 def make_pose_examples(
     pipeline: Pipeline, realising: Pipeline, context: Context, points: np.ndarray, params: PosePolicyParams
 ) -> PoseExamples:
@@ -61,12 +85,8 @@ def make_pose_examples(
         realising: by whose stage ik contacts are realised for the second network, unless the pipeline has stage close.
         points: of the policy, (M, 3) base frame [m].
     """
-    most = _GPU_BATCH if context.device.startswith("cuda") else _CPU_BATCH
-    parts = [
-        _batch(pipeline, realising, context, points, params, first, min(most, params.candidates - first))
-        for first in range(0, params.candidates, most)
-    ]
-    return join_examples(parts)
+    batches = _batches(context, params.candidates)
+    return join_examples([_batch(pipeline, realising, context, points, params, *batch) for batch in batches])
 
 
 def _batch(

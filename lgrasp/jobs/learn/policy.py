@@ -1,6 +1,7 @@
 """Train a pose policy for a hand: examples by its pipeline, two networks, one file."""
 
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar
 
@@ -16,7 +17,14 @@ from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.hands import for_hand, hand_source
-from lgrasp.jobs.learn.examples import PoseExamples, join_examples, make_pose_examples, reach_points
+from lgrasp.jobs.learn.examples import (
+    PoseExamples,
+    join_examples,
+    make_pose_examples,
+    reach_points,
+    source_weights,
+    source_yields,
+)
 from lgrasp.jobs.learn.network import FileJob
 from lgrasp.jobs.requests.learn import PolicyRequest
 from lgrasp.learn.policy import fit_network, ranking, rate
@@ -27,8 +35,9 @@ from lgrasp.object.shapes import random_shape
 from lgrasp.policy.model import PosePolicy, policy_bytes, read_policy
 from lgrasp.stages.context import Context
 
-_VERSION = 1
+_VERSION = 2
 _LEAST = 16  # poses that gave a grasp
+_SOURCE_SHARE = 4  # each source of poses alone gets one of so many candidates
 
 
 class PolicyJob(PolicyRequest, FileJob):
@@ -94,7 +103,11 @@ class PolicyJob(PolicyRequest, FileJob):
         start = time.perf_counter()
         examples: list[PoseExamples] = []
         with ThreadPoolExecutor(self.threads()) as pool:
-            for found in pool.map(lambda number: self._examples(number, points), range(self.count)):
+            learned = self.learned
+            sources = self._sources(learned, pool)
+            weights = {name: weight * sources[name] for name, weight in source_weights(learned).items()}
+            learned = learned.with_params("place", **weights)
+            for found in pool.map(lambda number: self._examples(learned, number, points), range(self.count)):
                 examples.append(found)
                 progress(len(examples), f"{sum(int(e.contacts_yields.sum()) for e in examples):,} poses gave grasps")
         seconds = {"examples": time.perf_counter() - start}
@@ -115,6 +128,7 @@ class PolicyJob(PolicyRequest, FileJob):
             "objects": ", ".join(self.objects) or f"{self.count} random shapes",
             "held_out": held,
             "poses": len(train.contacts_yields) + len(test.contacts_yields),
+            "sources": {name: weight / sum(weights.values()) for name, weight in weights.items()},
             "yielding": int(train.contacts_yields.sum() + test.contacts_yields.sum()),
             "reach": ranking(rate(by_reach, test.reach), test.reach_yields),
             "contacts": ranking(rate(by_contacts, test.contacts), test.contacts_yields),
@@ -122,20 +136,28 @@ class PolicyJob(PolicyRequest, FileJob):
             "curves": {"reach": reach_curve, "contacts": contacts_curve},
         }
         about = {"run_key": self.key(), "report": {k: v for k, v in report.items() if k != "seconds"}}
-        made = PosePolicy(
-            hand.name, hand.tree.joint_names, hand.groups, points, by_reach.weights(), by_contacts.weights(), about
-        )
+        networks = by_reach.weights(), by_contacts.weights()
+        made = PosePolicy(hand.name, hand.tree.joint_names, hand.groups, points, *networks, sources, about)
         return Made(part.rows, policy_bytes(made), report)
 
-    def _examples(self, number: int, points: np.ndarray) -> PoseExamples:
+    def _sources(self, learned: Pipeline, pool: ThreadPoolExecutor) -> dict[str, float]:
+        """Share of candidates that give grasps by each source of poses alone; as if one more did, none is never."""
+        tried = max(1, self.params.candidates // _SOURCE_SHARE)
+        counts = pool.map(lambda k: source_yields(learned, self._context(learned, k), tried), range(self.count))
+        found = sum((Counter(each) for each in counts), Counter())
+        return {name: (found[name] + 1) / (self.count * tried + 1) for name in source_weights(learned)}
+
+    def _examples(self, learned: Pipeline, number: int, points: np.ndarray) -> PoseExamples:
+        realising = self.pipeline.without("adjust", "close")
+        return make_pose_examples(learned, realising, self._context(learned, number), points, self.params)
+
+    def _context(self, learned: Pipeline, number: int) -> Context:
+        """In which an object is searched."""
         assert self._hand is not None
         assert self._field is not None
-        p, alias = self.params, self.device_used.alias
-        obj = upload_object(self._object(number), alias)
-        learned = self.learned
-        parts = self._hand, obj, self._field, alias, p.seed, number
-        context = Context(*parts, bounds=learned.bounds, realised=learned.realised)
-        return make_pose_examples(learned, self.pipeline.without("adjust", "close"), context, points, p)
+        alias = self.device_used.alias
+        parts = self._hand, upload_object(self._object(number), alias), self._field, alias, self.params.seed, number
+        return Context(*parts, bounds=learned.bounds, realised=learned.realised)
 
     def _object(self, number: int) -> ObjectModel:
         params, alias = self.learned.object, self.device_used.alias

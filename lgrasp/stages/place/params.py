@@ -10,6 +10,9 @@ from lgrasp.policy.names import SHIPPED, policy_digest
 NO_BOUND = 10.0
 """[m] farther from the centre of mass than any line between two contacts."""
 
+SOURCES = ("canonical", "exhaustive", "pinch", "palm")
+"""Of poses; each has a weight."""
+
 
 class PlaceParams(Params):
     """Where objects are put; weights need not sum to 1."""

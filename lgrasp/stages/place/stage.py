@@ -1,5 +1,7 @@
 """place: candidate indices -> object poses in the hand base frame that static links do not block."""
 
+from collections.abc import Mapping
+
 import warp as wp
 
 from lgrasp.errors import ConfigError
@@ -12,7 +14,7 @@ from lgrasp.stages.place.choose import best_poses
 from lgrasp.stages.place.favoured import favoured_palm
 from lgrasp.stages.place.kernels import propose_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed
-from lgrasp.stages.place.params import PlaceParams
+from lgrasp.stages.place.params import SOURCES, PlaceParams
 from lgrasp.stages.place.predicted_kernels import propose_predicted
 from lgrasp.stages.place.structs import PlaceValues, ProposedPoses
 
@@ -35,12 +37,13 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
         ConfigError: all weights are zero.
     """
     first, count = inputs
-    shares = _shares(params, context.field, palm=context.steered.touching.palm)
+    rated = context.policy is not None and not context.opposed
+    sources = context.networks.sources if rated else {}
+    shares = _shares(params, sources, context.field, palm=context.steered.touching.palm)
     d = context.device
     if not isinstance(first, wp.array):
         first = wp.full(1, first, dtype=wp.int32, device=d)
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
-    rated = context.policy is not None and not context.opposed
     groups, shape = context.hand.model.groups, (count, params.policy_proposals if rated else params.proposals)
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
     regions = context.object.steered
@@ -61,13 +64,15 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     return best_poses(proposals, values, first, context)
 
 
-def _shares(params: PlaceParams, field: FieldArrays, *, palm: bool) -> dict[str, float]:
-    """Share of each source in the proposals; where the palm must touch, of those that put the object on it."""
-    weights = {name: getattr(params, name) for name in ("canonical", "exhaustive", "pinch", "palm")}
+def _shares(params: PlaceParams, learnt: Mapping[str, float], field: FieldArrays, *, palm: bool) -> dict[str, float]:
+    """Share of each source in the proposals, by weight and by what it was ``learnt`` to be worth; where the palm must
+    touch, of those that put the object on it."""
+    weights = {name: getattr(params, name) for name in SOURCES}
     if palm:
         on_palm = bool((field.model.pair_slot < 0).any(1).all())  # pairs of a lone finger and the palm
         weights |= {"canonical": 0.0, "exhaustive": 0.0, "palm": params.palm or 1.0}
         weights["pinch"] = params.pinch if on_palm else 0.0
+    weights = {name: weight * learnt.get(name, 1.0) for name, weight in weights.items()}
     total = sum(weights.values())
     if total <= 0:
         raise ConfigError("place: weights canonical, exhaustive, pinch and palm are all 0; one must be positive")
