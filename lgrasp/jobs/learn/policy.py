@@ -104,12 +104,13 @@ class PolicyJob(PolicyRequest, FileJob):
         examples: list[PoseExamples] = []
         with ThreadPoolExecutor(self.threads()) as pool:
             learned = self.learned
-            sources = self._sources(learned, pool)
+            sources = self._sources(learned, pool, progress)
             weights = {name: weight * sources[name] for name, weight in source_weights(learned).items()}
             learned = learned.with_params("place", **weights)
             for found in pool.map(lambda number: self._examples(learned, number, points), range(self.count)):
                 examples.append(found)
-                progress(len(examples), f"{sum(int(e.contacts_yields.sum()) for e in examples):,} poses gave grasps")
+                yielding = sum(int(e.contacts_yields.sum()) for e in examples)
+                progress((self.count + len(examples)) // 2, f"{yielding:,} poses gave grasps")
         seconds = {"examples": time.perf_counter() - start}
         order = np.random.default_rng(p.seed).permutation(self.count)
         held = max(1, round(p.held_out * self.count))
@@ -140,11 +141,14 @@ class PolicyJob(PolicyRequest, FileJob):
         made = PosePolicy(hand.name, hand.tree.joint_names, hand.groups, points, *networks, sources, about)
         return Made(part.rows, policy_bytes(made), report)
 
-    def _sources(self, learned: Pipeline, pool: ThreadPoolExecutor) -> dict[str, float]:
+    def _sources(self, learned: Pipeline, pool: ThreadPoolExecutor, progress: PartProgress) -> dict[str, float]:
         """Share of candidates that give grasps by each source of poses alone; as if one more did, none is never."""
         tried = max(1, self.params.candidates // _SOURCE_SHARE)
         counts = pool.map(lambda k: source_yields(learned, self._context(learned, k), tried), range(self.count))
-        found = sum((Counter(each) for each in counts), Counter())
+        found: Counter[str] = Counter()
+        for number, each in enumerate(counts, 1):
+            found.update(each)
+            progress(number // 2, "sources of poses, each alone")
         return {name: (found[name] + 1) / (self.count * tried + 1) for name in source_weights(learned)}
 
     def _examples(self, learned: Pipeline, number: int, points: np.ndarray) -> PoseExamples:
