@@ -53,7 +53,7 @@ class PosePolicy:
     reach: Weights
     contacts: Weights
     sources: dict[str, float] = field(default_factory=dict)
-    """Share of candidates that gave grasps where all poses came from one source of stage place, by its name."""
+    """Factors of the weights of stage place's sources, by name, at most 1: what each was learnt to be worth."""
     about: dict[str, Any] = field(default_factory=dict)
     """How it was trained."""
 
@@ -79,9 +79,9 @@ def read_policy(path: str | Path) -> PosePolicy:
         if about.pop("format") != _FORMAT or about.pop("version") != _VERSION:
             raise ValueError("other format or version")
         points = arrays["points"].astype(np.float32)
-        sources = {str(name): float(share) for name, share in about.pop("sources", {}).items()}
-        if not all(0 < share <= 1 for share in sources.values()):
-            raise ValueError(f"shares of sources {sources}")
+        sources = {str(name): float(worth) for name, worth in about.pop("sources", {}).items()}
+        if not all(0 < worth <= 1 for worth in sources.values()):
+            raise ValueError(f"factors of sources {sources}")
         made = PosePolicy(
             about.pop("hand"),
             tuple(about.pop("joints")),

@@ -77,7 +77,7 @@ def test_sources_of_a_policy_weigh_those_of_the_pipeline(searched, policy):
     worth = {"canonical": 0.25, "exhaustive": 0.5, "pinch": 0.125, "palm": 0.5}
     weights = {"canonical": 0.5, "exhaustive": 0.25, "pinch": 1.0, "palm": 0.25}
     (learnt,) = searched(policy(sources=worth), **weights)
-    (by_hand,) = searched(policy(), **{name: weights[name] * share for name, share in worth.items()})
+    (by_hand,) = searched(policy(), **{name: weights[name] * factor for name, factor in worth.items()})
     assert len(learnt.grasps) > 10
     np.testing.assert_array_equal(learnt.grasps.pose, by_hand.grasps.pose)
 
@@ -213,7 +213,7 @@ def test_refused_files(swift, policy, tmp_path, inputs):
     cut = tmp_path / "cut.npz"
     cut.write_bytes(good.read_bytes()[:-100])
     assert "is no pose policy" in refused(cut)
-    assert "shares of sources" in refused(policy(sources={"pinch": float("nan")}))
+    assert "factors of sources" in refused(policy(sources={"pinch": float("nan")}))
     other = read_policy(good)
     assert "weights of shape" in refused(policy(reach=other.contacts))
     other.reach.rows[0, 0] = np.nan

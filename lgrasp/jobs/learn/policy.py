@@ -1,5 +1,6 @@
 """Train a pose policy for a hand: examples by its pipeline, two networks, one file."""
 
+import math
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
@@ -105,7 +106,7 @@ class PolicyJob(PolicyRequest, FileJob):
         with ThreadPoolExecutor(self.threads()) as pool:
             learned = self.learned
             sources = self._sources(learned, pool, progress)
-            weights = {name: weight * sources[name] for name, weight in source_weights(learned).items()}
+            weights = {name: weight * sources.get(name, 1.0) for name, weight in source_weights(learned).items()}
             learned = learned.with_params("place", **weights)
             for found in pool.map(lambda number: self._examples(learned, number, points), range(self.count)):
                 examples.append(found)
@@ -142,14 +143,17 @@ class PolicyJob(PolicyRequest, FileJob):
         return Made(part.rows, policy_bytes(made), report)
 
     def _sources(self, learned: Pipeline, pool: ThreadPoolExecutor, progress: PartProgress) -> dict[str, float]:
-        """Share of candidates that give grasps by each source of poses alone; as if one more did, none is never."""
+        """Factors of the weights of several sources of poses: the root of the share of candidates that give grasps by
+        each alone, as if one more did. By the share itself rare ways to hold an object would be rarer still."""
+        if len(source_weights(learned)) < 2:
+            return {}
         tried = max(1, self.params.candidates // _SOURCE_SHARE)
         counts = pool.map(lambda k: source_yields(learned, self._context(learned, k), tried), range(self.count))
         found: Counter[str] = Counter()
         for number, each in enumerate(counts, 1):
             found.update(each)
             progress(number // 2, "sources of poses, each alone")
-        return {name: (found[name] + 1) / (self.count * tried + 1) for name in source_weights(learned)}
+        return {name: math.sqrt((found[name] + 1) / (self.count * tried + 1)) for name in source_weights(learned)}
 
     def _examples(self, learned: Pipeline, number: int, points: np.ndarray) -> PoseExamples:
         realising = self.pipeline.without("adjust", "close")
