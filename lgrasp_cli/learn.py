@@ -309,7 +309,7 @@ def _show_policy(data: dict[str, Any]) -> list[Block]:
         ("poses", f"{data['poses']:,}; {data['yielding']:,} gave grasps"),
     ]
     shares = ", ".join(f"{name} {share:.1%}" for name, share in data["sources"].items())
-    pairs.append(("sources", f"{shares} of the poses to propose"))
+    pairs.append(("sources", f"{shares} of the poses; {data['proposals']} are rated per candidate"))
     words = (("reach", "rated in place"), ("contacts", "after the first contacts"))
     for name, what in words:
         if data[name] is not None:

@@ -138,7 +138,8 @@ class Pipeline(_Head):
         the object must be near by."""
         points = max(self.object.contact_count, self.params("close").contact_count)
         dense = self.object.model_copy(update={"contact_count": points})
-        proposals = min(self.params("place").policy_proposals, self.params("close").policy_proposals)
+        most = self.params("close").policy_proposals
+        proposals = min(self.params("place").policy_proposals or most, most)
         kept = self.without("domain", "ik", "wrap").with_params("place", samples=0, policy_proposals=proposals)
         return kept.model_copy(update={"object": dense})
 

@@ -27,18 +27,19 @@ class Network:
 
 @dataclass(frozen=True, eq=False)
 class PolicyArrays:
-    """The networks of a policy on one device; of no policy, without rows. ``sources`` as of the policy."""
+    """The networks of a policy on one device; of no policy, without rows. Other fields as of the policy."""
 
     reach: "Network"
     contacts: "Network"
     sources: Mapping[str, float]
+    proposals: int
 
 
 def upload_policy(policy: PosePolicy | None, device: str) -> PolicyArrays:
     """Put a policy on a device; None rates nothing."""
     if policy is None:
         none = {"rows": np.zeros((0, WIDTH), np.float32), "points": np.zeros((0, 3), np.float32)}
-        return PolicyArrays(*(upload_struct(Network, device, none) for _ in range(2)), sources={})
+        return PolicyArrays(*(upload_struct(Network, device, none) for _ in range(2)), sources={}, proposals=0)
     points = {"reach": policy.points, "contacts": policy.points[:0]}
     return PolicyArrays(
         **{
@@ -48,4 +49,5 @@ def upload_policy(policy: PosePolicy | None, device: str) -> PolicyArrays:
             for name, at in points.items()
         },
         sources=policy.sources,
+        proposals=policy.proposals,
     )

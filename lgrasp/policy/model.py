@@ -21,6 +21,8 @@ MOST_HITS = 8
 """Contacts of a group that a network is told."""
 POINTS = 32
 """Points of the hand's reach where it is told how far the object is."""
+LEAST_PROPOSALS, MOST_PROPOSALS = 16, 64
+"""Poses of a candidate that a policy rates: where grasps are common, where they are rare."""
 _FORMAT, _VERSION = "lgrasp-pose-policy", 1
 
 
@@ -54,6 +56,8 @@ class PosePolicy:
     contacts: Weights
     sources: dict[str, float] = field(default_factory=dict)
     """Factors of the weights of stage place's sources, by name, at most 1: what each was learnt to be worth."""
+    proposals: int = LEAST_PROPOSALS
+    """Poses that are worth rating per candidate."""
     about: dict[str, Any] = field(default_factory=dict)
     """How it was trained."""
 
@@ -82,6 +86,9 @@ def read_policy(path: str | Path) -> PosePolicy:
         sources = {str(name): float(worth) for name, worth in about.pop("sources", {}).items()}
         if not all(0 < worth <= 1 for worth in sources.values()):
             raise ValueError(f"factors of sources {sources}")
+        proposals = int(about.pop("proposals", LEAST_PROPOSALS))
+        if not LEAST_PROPOSALS <= proposals <= MOST_PROPOSALS:
+            raise ValueError(f"{proposals} proposals")
         made = PosePolicy(
             about.pop("hand"),
             tuple(about.pop("joints")),
@@ -90,6 +97,7 @@ def read_policy(path: str | Path) -> PosePolicy:
             Weights(arrays["reach"].astype(np.float32)),
             Weights(arrays["contacts"].astype(np.float32)),
             sources,
+            proposals,
             about,
         )
         for weights, count in ((made.reach, len(points)), (made.contacts, 0)):
@@ -110,7 +118,7 @@ def policy_bytes(policy: PosePolicy) -> bytes:
     """The file of a policy."""
     data = io.BytesIO()
     about: dict[str, Any] = {"format": _FORMAT, "version": _VERSION, "hand": policy.hand, "joints": list(policy.joints)}
-    about |= {"groups": policy.groups, "sources": policy.sources, **policy.about}
+    about |= {"groups": policy.groups, "sources": policy.sources, "proposals": policy.proposals, **policy.about}
     arrays = {"points": policy.points, "reach": policy.reach.rows, "contacts": policy.contacts.rows}
     np.savez(
         data,

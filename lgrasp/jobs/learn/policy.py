@@ -33,11 +33,12 @@ from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.preprocess import preprocess_object
 from lgrasp.object.shapes import random_shape
-from lgrasp.policy.model import PosePolicy, policy_bytes, read_policy
+from lgrasp.policy.model import LEAST_PROPOSALS, MOST_PROPOSALS, PosePolicy, policy_bytes, read_policy
 from lgrasp.stages.context import Context
 
 _VERSION = 2
 _LEAST = 16  # poses that gave a grasp
+_PROPOSALS = 5  # worth rating if every pose gave a grasp; more as the root of how rare those are
 _SOURCE_SHARE = 4  # each source of poses alone gets one of so many candidates
 
 
@@ -110,8 +111,8 @@ class PolicyJob(PolicyRequest, FileJob):
             learned = learned.with_params("place", **weights)
             for found in pool.map(lambda number: self._examples(learned, number, points), range(self.count)):
                 examples.append(found)
-                yielding = sum(int(e.contacts_yields.sum()) for e in examples)
-                progress((self.count + len(examples)) // 2, f"{yielding:,} poses gave grasps")
+                held = sum(int(e.contacts_yields.sum()) for e in examples)
+                progress((self.count + len(examples)) // 2, f"{held:,} poses gave grasps")
         seconds = {"examples": time.perf_counter() - start}
         order = np.random.default_rng(p.seed).permutation(self.count)
         held = max(1, round(p.held_out * self.count))
@@ -121,6 +122,9 @@ class PolicyJob(PolicyRequest, FileJob):
                 f"{int(train.contacts_yields.sum())} poses gave grasps; at least {_LEAST} are needed to learn from: "
                 f"raise candidates or shapes"
             )
+        yielding = int(train.contacts_yields.sum() + test.contacts_yields.sum())
+        worth = _PROPOSALS / math.sqrt(yielding / (self.count * p.candidates))
+        proposals = min(max(round(worth), LEAST_PROPOSALS), MOST_PROPOSALS)
         start = time.perf_counter()
         by_reach, reach_curve = fit_network(train.reach, train.reach_yields, p)
         by_contacts, contacts_curve = fit_network(train.contacts, train.contacts_yields, p)
@@ -131,7 +135,8 @@ class PolicyJob(PolicyRequest, FileJob):
             "held_out": held,
             "poses": len(train.contacts_yields) + len(test.contacts_yields),
             "sources": {name: weight / sum(weights.values()) for name, weight in weights.items()},
-            "yielding": int(train.contacts_yields.sum() + test.contacts_yields.sum()),
+            "proposals": proposals,
+            "yielding": yielding,
             "reach": ranking(rate(by_reach, test.reach), test.reach_yields),
             "contacts": ranking(rate(by_contacts, test.contacts), test.contacts_yields),
             "seconds": seconds,
@@ -139,7 +144,7 @@ class PolicyJob(PolicyRequest, FileJob):
         }
         about = {"run_key": self.key(), "report": {k: v for k, v in report.items() if k != "seconds"}}
         networks = by_reach.weights(), by_contacts.weights()
-        made = PosePolicy(hand.name, hand.tree.joint_names, hand.groups, points, *networks, sources, about)
+        made = PosePolicy(hand.name, hand.tree.joint_names, hand.groups, points, *networks, sources, proposals, about)
         return Made(part.rows, policy_bytes(made), report)
 
     def _sources(self, learned: Pipeline, pool: ThreadPoolExecutor, progress: PartProgress) -> dict[str, float]:

@@ -50,8 +50,11 @@ class PlaceParams(Params):
         description="What rates poses in place of opposed contacts: a file of 'learn fit --model pose', or hand: the "
         "one that is shipped with the hand, if there is one.",
     )
-    policy_proposals: int = Field(
-        default=16, ge=1, le=1024, description="Poses tried per candidate where a policy rates them."
+    policy_proposals: int | None = Field(
+        default=None,
+        ge=1,
+        le=1024,
+        description="Poses tried per candidate where a policy rates them; null: as many as it was learnt to be worth.",
     )
     policy_temperature: float = Field(
         default=0.5,

@@ -44,7 +44,8 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     if not isinstance(first, wp.array):
         first = wp.full(1, first, dtype=wp.int32, device=d)
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
-    groups, shape = context.hand.model.groups, (count, params.policy_proposals if rated else params.proposals)
+    tried = (params.policy_proposals or context.networks.proposals) if rated else params.proposals
+    groups, shape = context.hand.model.groups, (count, tried)
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
     regions = context.object.steered
     # of contacts that must be far from the centre of mass, the line between two is far from it as well
