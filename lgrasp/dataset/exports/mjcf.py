@@ -11,7 +11,7 @@ from trimesh import Trimesh
 from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, mesh_text, object_text
 from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.mjcf_scene import Keyframe, MjcfScene, SceneObject
-from lgrasp.dataset.exports.reading import GraspSet, open_folder, order_of
+from lgrasp.dataset.exports.reading import WRONG, GraspSet, open_folder, order_of
 from lgrasp.dataset.exports.selection import Selection
 from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
@@ -127,8 +127,7 @@ def read_mjcf(path: Path | str, *, joint_names: Sequence[str] | None = None) -> 
 
 def _read(file: Path, joint_names: Sequence[str]) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
     """Joints of grasp, pregrasp and squeeze, shape [3, K]; code and pose in the world of every object."""
-    kinds = (etree.XMLSyntaxError, AttributeError, IndexError, KeyError, TypeError, ValueError)
-    with parsing(file, "a scene of an export", kinds):
+    with parsing(file, "a scene of an export", (etree.XMLSyntaxError, *WRONG)):
         root = etree.fromstring(file.read_bytes(), etree.XMLParser(resolve_entities=False, no_network=True))
         keys = {key.get("name"): key for key in root.iter("key")}
         at, before = (np.array(keys[name].get("qpos").split(), float) for name in _KEYS[:2])

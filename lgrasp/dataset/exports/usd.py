@@ -10,7 +10,7 @@ from trimesh import Trimesh
 from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames, free_name
 from lgrasp.dataset.exports.mjcf import Cut
-from lgrasp.dataset.exports.reading import GraspSet, open_folder
+from lgrasp.dataset.exports.reading import WRONG, GraspSet, numbers, open_folder
 from lgrasp.dataset.exports.selection import ExportObject, Selection
 from lgrasp.dataset.files import parsing
 from lgrasp.errors import ConfigError, ShardError
@@ -146,19 +146,16 @@ def read_usd(path: Path | str, *, joint_names: Sequence[str] | None = None) -> G
     :func:`~lgrasp.dataset.exports.formats.read_grasps`."""
     usd = import_pxr().Usd
     folder = open_folder(path, ".usdc", "usd", joint_names)
-    index, poses, q = [], [], []
     for file in folder.files:
-        with parsing(file, "a stage of USD", (RuntimeError, TypeError, ValueError)):
+        with parsing(file, "a stage of USD", (RuntimeError, *WRONG)):
             stage = usd.Stage.Open(str(file))
             hand = stage.GetPrimAtPath(_HAND)
             names = hand.GetAttribute("lgrasp:jointNames").Get() if hand else None
             if not names:
                 raise ShardError(f"{file}: names no joints ({_HAND}, lgrasp:jointNames); stages of lgrasp are read")
-            order = folder.order(list(map(str, names)), file)
             root = hand.GetAttribute("lgrasp:root")
             times = root.GetTimeSamples()
-            joints = np.array([[hand.GetAttribute(f"lgrasp:{name}").Get(t) for name in _POSTURES] for t in times])
-            poses.append(pose_from_matrix(np.array([root.Get(t) for t in times]).reshape(-1, 4, 4).mT))
-        q.append(joints[:, :, order])
-        index += [folder.place(file.stem)] * len(times)
-    return folder.single(np.concatenate(q), np.concatenate(poses), index)
+            q = [[hand.GetAttribute(f"lgrasp:{name}").Get(t) for name in _POSTURES] for t in times]
+            T = numbers([root.Get(t) for t in times], "lgrasp:root", -1, 4, 4)
+            folder.add(file, names, q, pose_from_matrix(T.mT), file.stem)
+    return folder.grasps()
