@@ -10,7 +10,8 @@ from lxml import etree
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse, pose_from_matrix
 from lgrasp.grasp.records import HandRecord
-from lgrasp.hand.urdf import Joint, check_robot, parse_robot
+from lgrasp.hand.links import joints_above
+from lgrasp.hand.urdf import check_robot, parse_robot
 
 
 def hand_files(hand: HandRecord, where: Path) -> dict[str, bytes]:
@@ -89,11 +90,7 @@ class HandFrames:
             joint.name: joint.mimic for joint in tree.joints if joint.mimic and joint.name not in self.joint_names
         }
         """Joints that are not in q: source joint, multiplier, offset."""
-        into = {joint.child: joint for joint in tree.joints}
-        self._carrying: list[Joint] = []  # from the base link up to the root
-        while base_link in into:
-            self._carrying.append(into[base_link])
-            base_link = into[base_link].parent
+        self._carrying = joints_above(tree.joints, base_link)
 
     def base_from_root(self, q: np.ndarray) -> np.ndarray:
         """``T_base_root``: poses [n, 7] of the URDF's root link in the base link's frame; q is [n, K]."""
