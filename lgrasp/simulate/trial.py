@@ -6,10 +6,9 @@ import numpy as np
 
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.draws import draw_of, tune
-from lgrasp.simulate.lift import Lifted, conclude_lift, lift_row
+from lgrasp.simulate.lift import Lifted, conclude_lift, lift_row, shake_course
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.mujoco_world import MujocoWorld
-from lgrasp.simulate.shake import shake_course
 from lgrasp.simulate.slip import Frames, points_on_links, slips
 from lgrasp.simulate.verdict import (
     AXES,
