@@ -118,7 +118,7 @@ WRITTEN_BY_HAND = {
     "lgrasp/bench/soak/processes.py": "a temporary folder",
     "lgrasp/bench/soak/trials.py": "a temporary folder",
     "lgrasp/dataset/report/plots.py": "a picture in memory",
-    "lgrasp/dataset/new_shard.py": "a file of lgrasp.files",
+    "lgrasp/dataset/writer.py": "a file of lgrasp.files",
     "lgrasp/engine/cache.py": "arrays in memory",
     "lgrasp/files.py": "the home",
     "lgrasp/geometry/decompose.py": "a pipe",

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -208,24 +208,11 @@ class SceneRows:
         return hand.name, " + ".join(o.id for o in objects)
 
 
-def draw_rows(
-    rows: SceneRows,
-    chosen: Sequence[int],
-    *,
-    stage: str = "grasp",
-    size: int,
-    columns: int = 0,
-    loading: Callable[[str, float], None] | None = None,
-) -> "Image.Image":
-    """Rows side by side, each with its number; arguments as those of :func:`draw_motion`.
-
-    Args:
-        stage: pregrasp, grasp or squeeze.
-    """
+def draw_rows(rows: SceneRows, chosen: Sequence[int], *, stage: str = "grasp", **options: Any) -> "Image.Image":
+    """Rows side by side at a stage: pregrasp, grasp or squeeze; options and errors as of :func:`draw_motion`."""
     from lgrasp.picture.scene import STAGES  # slow to load
 
-    times = [list(STAGES).index(stage)]
-    return draw_motion(rows, chosen, times, size=size, columns=columns, loading=loading)[0]
+    return draw_motion(rows, chosen, [list(STAGES).index(stage)], **options)[0]
 
 
 def draw_motion(

@@ -8,8 +8,7 @@ from functools import reduce
 import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.report.coverage import Coverage
-from lgrasp.dataset.report.diversity import GraspSpread, TouchedSurface
+from lgrasp.dataset.report.diversity import Coverage, GraspSpread, TouchedSurface
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.verdicts import HeldRows, Verdicts, add_held, add_verdicts
 from lgrasp.geometry.poses import pose_matrix

@@ -6,7 +6,7 @@ from typing import Any
 
 import jinja2
 
-from lgrasp.dataset.report.coverage import principal_postures
+from lgrasp.dataset.report.diversity import principal_postures
 from lgrasp.dataset.report.gather import HandRows
 from lgrasp.dataset.report.plots import (
     MAPS,

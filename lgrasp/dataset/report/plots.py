@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.report.coverage import Posture
+from lgrasp.dataset.report.diversity import Posture
 from lgrasp.dataset.report.quantity import Distribution
 
 MAPS = 12
