@@ -214,8 +214,9 @@ class GraspDataset(TorchRows, torch.utils.data.Dataset):
         rows: list[list[int]] = [[] for _ in shares]
         for source, end in zip(self._sources, self._ends, strict=True):
             with self._open(source) as reader:
-                for k, own in enumerate(rows):
-                    own += (np.flatnonzero(drawn.holds(str(k), reader)) + end - source.rows).tolist()
+                numbers = drawn.numbers(reader)
+            for k, own in enumerate(rows):
+                own += (np.flatnonzero(numbers == k) + end - source.rows).tolist()
         return [torch.utils.data.Subset(self, own) for own in rows]
 
     def _locate(self, index: int) -> tuple[int, int]:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from lgrasp.judge import bounds
 from lgrasp.judge.bounds import REGION_WEIGHT, JudgeError
 from lgrasp.judge.collision import JudgedHand, JudgedObject, hand_in_object
+from lgrasp.judge.hand import pose_transforms
 
 COSINE_SLACK = 1e-4
 """Of the palm's direction outside its cone."""
@@ -135,10 +136,7 @@ def _matrices(poses: np.ndarray) -> np.ndarray:
     """Poses x y z qw qx qy qz, (T, 7), as (T, 4, 4)."""
     if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all():
         raise ValueError(f"poses of shape {poses.shape} are none")
-    T = np.tile(np.eye(4), (len(poses), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(poses[:, 3:], scalar_first=True).as_matrix()
-    T[:, :3, 3] = poses[:, :3]
-    return T
+    return pose_transforms(poses[:, :3], Rotation.from_quat(poses[:, 3:], scalar_first=True))
 
 
 def _comparable(T: np.ndarray) -> np.ndarray:

@@ -89,7 +89,12 @@ def assemble(
     loads = [protocol.load(solid.volume) for solid in objects]
     spec = mujoco.MjSpec.from_string(bare_urdf(hand.record.urdf, held))
     set_options(mujoco, spec, protocol)
-    _add_pieces(mujoco, spec, hand)
+    for link, pieces in hand.pieces.items():
+        body = spec.body(link)
+        if body is None and pieces:
+            raise PhysicsError(f"MuJoCo does not know link '{link}' of hand '{hand.record.name}'")
+        for number, piece in enumerate(pieces):
+            _add_piece(mujoco, spec, body, piece, f"{link} {number}")
     for equality in spec.equalities:
         equality.solref, equality.solimp[:2] = [2.0 * protocol.timestep, 1.0], _COUPLING
     followers = {equality.name1 for equality in spec.equalities}
@@ -109,15 +114,6 @@ def assemble(
     for a, b in _always_touching(mujoco, model):
         spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
     return spec
-
-
-def _add_pieces(mujoco: Any, spec: Any, hand: HandSolids) -> None:
-    for link, pieces in hand.pieces.items():
-        body = spec.body(link)
-        if body is None and pieces:
-            raise PhysicsError(f"MuJoCo does not know link '{link}' of hand '{hand.record.name}'")
-        for number, piece in enumerate(pieces):
-            _add_piece(mujoco, spec, body, piece, f"{link} {number}")
 
 
 def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> None:

@@ -81,11 +81,6 @@ class WorldTrials:
         T = np.block([[turn, at[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
         self._base, self._base_rotation = pose_from_matrix(T[None])[0], turn
 
-    @property
-    def steps(self) -> int:
-        """World-steps simulated so far."""
-        return self._sim.steps + sum(sim.steps for sim in self._pulled)
-
     def run(self, rows: GraspRows, progress: Callable[[int, int], None] | None = None) -> list[Verdict]:
         """The verdicts of all rows."""
         found: list[Verdict] = []

@@ -52,7 +52,6 @@ class Lifted(NamedTuple):
     settled: bool = False
     on_table: bool = False
     diverged: bool = False
-    steps: int = 0
 
 
 def check_liftable(protocol: Protocol, scene: Scene, rows: GraspRows) -> None:
@@ -199,12 +198,12 @@ def _carry(world: "MujocoWorld | PhysxWorld", model: Model, course: LiftCourse, 
         world.step(1)
         if (step + 1) % chunk == 0 or step + 1 == total:
             if world.wild():
-                return Lifted(pushed, settled=settled, diverged=True, steps=step + 1)
+                return Lifted(pushed, settled=settled, diverged=True)
             if step >= counts:
                 far = np.maximum(far, moved(world.objects(), home, model.centers))
                 if bounds.lost(far):
-                    return Lifted(pushed, far.max(0), settled, world.on_table(), steps=step + 1)
-    return Lifted(pushed, far.max(0), settled, world.on_table(), steps=total)
+                    break
+    return Lifted(pushed, far.max(0), settled, world.on_table())
 
 
 def _table_at(model: Model, pose: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:

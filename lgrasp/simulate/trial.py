@@ -47,7 +47,6 @@ class Trial:
         self._timestep = model.mujoco.opt.timestep
         self._chunk = self._steps(chunk_of(self._protocol))
         self._bounds = Bounds(model.protocol)
-        self.steps = 0
 
     def _steps(self, seconds: float) -> int:
         return max(1, round(seconds / self._timestep))
@@ -92,10 +91,8 @@ class Trial:
 
     def _lift(self, rows: GraspRows, i: int, look: Look) -> Verdict:
         """Take the object of row ``i`` off its table."""
-        found = Lifted()
-        if look.depth <= self._protocol.most_penetration:
-            found = lift_row(self._world, self._model, rows, i)
-            self.steps += found.steps
+        fits = look.depth <= self._protocol.most_penetration
+        found = lift_row(self._world, self._model, rows, i) if fits else Lifted()
         return conclude_lift(self._bounds, look, found)
 
     def _close(self, rows: GraspRows, i: int, look: Look) -> Closed:
@@ -109,7 +106,7 @@ class Trial:
                 steps += round(self._protocol.rest / self._timestep)
             for step in range(steps):
                 self._world.drive(a + (b - a) * min((step + 1) / ramp, 1.0))
-                self._step(1)
+                self._world.step(1)
                 if (step + 1) % self._chunk == 0 or step + 1 == steps:
                     worst = np.maximum(worst, self._moved())
                     if self._world.wild():
@@ -123,7 +120,7 @@ class Trial:
     def _touching_at_rest(self) -> int:
         """Fewest links on any object, at rest at the targets; the trial then continues from the previous state."""
         before = self._world.state()
-        self._step(self._steps(self._protocol.settle))
+        self._world.step(self._steps(self._protocol.settle))
         touching = self._world.links_touching()
         self._world.restore(before)
         return int(touching.min())
@@ -179,11 +176,7 @@ class Trial:
         """One step under each load (n, 3)."""
         for some in [load] if (load == load[0]).all() else load[:, None]:
             self._world.push(self._model.forces[:, None] * some[0])
-            self._step(len(some))
-
-    def _step(self, steps: int) -> None:
-        self._world.step(steps)
-        self.steps += steps
+            self._world.step(len(some))
 
     def _look_at_q(self, rows: GraspRows, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Contact points on their links at q, (O, C, 3) in body frames [m], and links within 1 mm of each object."""

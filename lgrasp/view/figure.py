@@ -93,7 +93,7 @@ class GraspFigure:
         self.shown: GraspScene | None = None
         self._time = 0.0
 
-    def show(self, grasp: GraspScene, colour: int = 0) -> None:
+    def show(self, grasp: GraspScene) -> None:
         """Show another row; the posture comes with :meth:`move`."""
         if self._hand is None or self._hand.shape is not grasp.hand:
             if self._hand is not None:
@@ -104,8 +104,8 @@ class GraspFigure:
         self._objects = []
         for i, placed in enumerate(grasp.objects):
             same = i < len(before) and before[i][0] is placed.mesh
-            colour_of = OBJECTS[(colour + i) % len(OBJECTS)]
-            node = before[i][1] if same else add_mesh(self._scene, f"{self.name}/object{i}", placed.mesh, colour_of)
+            colour = OBJECTS[i % len(OBJECTS)]
+            node = before[i][1] if same else add_mesh(self._scene, f"{self.name}/object{i}", placed.mesh, colour)
             place(node, placed.pose)
             self._objects.append((placed.mesh, node))
         for _, node in before[len(grasp.objects) :]:
