@@ -155,12 +155,12 @@ class JudgedRegions:
     """Surface points (S, 3) with their weights in what is to be touched and to be avoided, as rows (S, 5).
 
     Raises:
-        JudgeError: numbers that are not finite, or a share out of range.
+        JudgeError: no points, numbers that are not finite, or a share out of range.
     """
 
     def __init__(self, points: np.ndarray, share: float) -> None:
-        if not np.isfinite(points).all() or not 0.0 < share <= 1.0:
-            raise JudgeError(f"regions: numbers that are not finite, or share {share:g}, which is not in (0, 1]")
+        if not len(points) or not np.isfinite(points).all() or not 0.0 < share <= 1.0:
+            raise JudgeError(f"regions: no points, numbers that are not finite, or share {share:g} outside of (0, 1]")
         self.tree = cKDTree(points[:, :3])
         self.touch, self.avoid = (points[:, k] >= REGION_WEIGHT for k in (3, 4))
         self.share = share

@@ -156,8 +156,14 @@ def _upload(painted: Sequence[Painted]) -> tuple[Any, wp.Mesh]:
     return solids, mesh
 
 
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue, 0 to 255, of a colour such as #ff8800."""
+    r, g, b = bytes.fromhex(colour[1:])
+    return r, g, b
+
+
 def _linear(colours: Sequence[str]) -> np.ndarray:
     """Linear colours (n, 3) of sRGB ones such as #ff8800."""
     names, which = np.unique(np.asarray(colours), return_inverse=True)
-    srgb = np.array([[int(name[i : i + 2], 16) / 255 for i in (1, 3, 5)] for name in names])
+    srgb = np.array([rgb(name) for name in names]) / 255
     return np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)[which.ravel()]

@@ -49,7 +49,12 @@ class Physics(Params):
     noslip: int = Field(default=2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
 
 
-def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
+def in_order(ends: tuple[float, float]) -> tuple[float, float]:
+    """A range, smallest number first.
+
+    Raises:
+        ValueError: it is not.
+    """
     if ends[0] > ends[1]:
         raise ValueError("the smaller number of a range comes first")
     return ends
@@ -57,9 +62,9 @@ def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
 
 _NotNegative = Annotated[float, Field(ge=0)]
 _Positive = Annotated[float, Field(gt=0)]
-Range = Annotated[tuple[_NotNegative, _NotNegative], AfterValidator(_in_order)]
+Range = Annotated[tuple[_NotNegative, _NotNegative], AfterValidator(in_order)]
 """Smallest and largest value."""
-PositiveRange = Annotated[tuple[_Positive, _Positive], AfterValidator(_in_order)]
+PositiveRange = Annotated[tuple[_Positive, _Positive], AfterValidator(in_order)]
 """Likewise, both above 0."""
 
 

@@ -8,7 +8,7 @@ import trimesh
 
 from lgrasp.geometry.poses import pose_from_matrix
 from lgrasp.hand.surface import joined_mesh
-from lgrasp.picture.draw import CONTACT, HAND, OBJECTS
+from lgrasp.picture.draw import CONTACT, HAND, OBJECTS, rgb
 from lgrasp.picture.scene import STAGES, GraspScene, HandShape, balls, split_edges
 
 if TYPE_CHECKING:
@@ -30,12 +30,6 @@ class Marks(NamedTuple):
     forces: bool = True
     cones: bool = False
     see_through: bool = False
-
-
-def rgb(colour: str) -> tuple[int, int, int]:
-    """Red, green and blue, 0 to 255, of a colour such as #ff8800."""
-    r, g, b = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
-    return r, g, b
 
 
 STAGE_MARKS = tuple((float(i), name) for i, name in enumerate(STAGES))

@@ -13,9 +13,9 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import space_sides
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.picture.draw import OBJECTS
+from lgrasp.picture.draw import OBJECTS, rgb
 from lgrasp.picture.scene import HandShape
-from lgrasp.view.figure import HandFigure, add_mesh, rgb, show_all
+from lgrasp.view.figure import HandFigure, add_mesh, show_all
 from lgrasp.view.page import Aim, add_saving
 from lgrasp.view.server import View
 

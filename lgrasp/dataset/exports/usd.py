@@ -87,8 +87,10 @@ class UsdWriter:
         for posture in _POSTURES:
             variants.AddVariant(posture)
         ops: dict[str, Any] = {}
+        taken: list[str] = []
         for link, mesh in self._shape.links.items():
-            path = f"{_HAND}/{free_name(self._pxr.Tf.MakeValidIdentifier(link), '', _last(ops))}"
+            taken.append(free_name(self._pxr.Tf.MakeValidIdentifier(link), "", taken))
+            path = f"{_HAND}/{taken[-1]}"
             ops[link] = geom.Xform.Define(stage, path).AddTransformOp()
             self._mesh(stage, f"{path}/mesh", mesh)
         hand.CreateAttribute("lgrasp:jointNames", types.StringArray).Set(list(self._frames.joint_names))
@@ -134,11 +136,6 @@ class UsdWriter:
         made.CreateSubdivisionSchemeAttr(self._pxr.UsdGeom.Tokens.none)
         if len(mesh.vertices):
             made.CreateExtentAttr(np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]).astype(np.float32))
-
-
-def _last(ops: dict[str, Any]) -> list[str]:
-    """Names of the prims that have transforms."""
-    return [op.GetAttr().GetPrim().GetName() for op in ops.values()]
 
 
 def read_usd(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
