@@ -176,12 +176,10 @@ def _write_object(group: h5py.Group, record: ObjectRecord) -> None:
     )
     create_array(group, "vertices", record.vertices, "f4")
     create_array(group, "faces", record.faces, "i4")
-    if record.normals is not None:
-        create_array(group, "normals", record.normals, "f4")
-    if record.tables is not None:
-        create_array(group, "tables", record.tables, "f4")
+    for name in ("normals", "tables", "regions"):
+        if (values := getattr(record, name)) is not None:
+            create_array(group, name, values, "f4")
     if record.regions is not None:
-        create_array(group, "regions", record.regions, "f4")
         group.attrs["touch_share"] = float(record.touch_share)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
-from lgrasp.runtime.optional import import_mujoco
+from lgrasp.runtime.optional import import_mujoco, import_optional
 from lgrasp.simulate.model import Model, leaders
 from lgrasp.simulate.verdict import WILD, links_touching
 
@@ -38,16 +38,9 @@ def import_physx() -> Any:
     Raises:
         PhysicsError: it is not installed.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of graphics that are not used
-            import sapien
-            import sapien.physx
-    except ImportError:
-        raise PhysicsError(
-            '--engine physx needs the package sapien, which is not installed: pip install "lgrasp[physx]"'
-        ) from None
-    return sapien
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of graphics that are not used
+        return import_optional("--engine physx needs the package sapien", '"lgrasp[physx]"', "sapien", "physx")
 
 
 class _Coupled(NamedTuple):

@@ -259,7 +259,7 @@ class Protocol(Physics):
 
 
 _GRAVITY: dict[str, Any] = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
-_SEQUENCE = {"start": "grasp", "success": "touches", "rest": 0.6, "most_rotation": 180.0, **_GRAVITY}
+_SEQUENCE: dict[str, Any] = {"start": "grasp", "success": "touches", "rest": 0.6, "most_rotation": 180.0, **_GRAVITY}
 _SEQUENCE |= {"timestep": 1 / 240}  # of 1/60 s each step is cut in four
 _PULLS = 100 / 60  # 100 steps
 

@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.poses import pose_from_matrix
+from lgrasp.grasp.records import ObjectRecord
 from lgrasp.hand.surface import joined_mesh
 from lgrasp.picture.draw import CONTACT, HAND, OBJECTS, rgb
 from lgrasp.picture.scene import STAGES, GraspScene, HandShape, balls, split_edges
@@ -82,7 +83,7 @@ class GraspFigure:
         self._scene, self.name = scene, name
         self.frame = scene.add_frame(name, show_axes=False)
         self._hand: HandFigure | None = None
-        self._objects: list[tuple[trimesh.Trimesh, viser.MeshHandle]] = []
+        self._objects: list[tuple[ObjectRecord, viser.MeshHandle]] = []
         self._marks: list[viser.SceneNodeHandle] = []
         self.shown: GraspScene | None = None
         self._time = 0.0
@@ -97,11 +98,11 @@ class GraspFigure:
         before = self._objects
         self._objects = []
         for i, placed in enumerate(grasp.objects):
-            same = i < len(before) and before[i][0] is placed.mesh
+            same = i < len(before) and before[i][0] is placed.record
             colour = OBJECTS[i % len(OBJECTS)]
             node = before[i][1] if same else add_mesh(self._scene, f"{self.name}/object{i}", placed.mesh, colour)
             place(node, placed.pose)
-            self._objects.append((placed.mesh, node))
+            self._objects.append((placed.record, node))
         for _, node in before[len(grasp.objects) :]:
             node.remove()
         self.shown = grasp

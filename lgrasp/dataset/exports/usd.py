@@ -17,6 +17,7 @@ from lgrasp.errors import ConfigError, ShardError
 from lgrasp.files import temporary_folder, write_file
 from lgrasp.geometry.poses import inverse, pose_from_matrix, pose_matrix
 from lgrasp.picture.scene import HandShape
+from lgrasp.runtime.optional import import_optional
 
 _POSTURES = ("grasp", "pregrasp", "squeeze")
 _HAND = "/World/hand"
@@ -39,15 +40,8 @@ def import_pxr() -> Any:
     Raises:
         ConfigError: they are not installed.
     """
-    try:
-        import pxr.Gf
-        import pxr.Sdf
-        import pxr.Tf
-        import pxr.Usd
-        import pxr.UsdGeom
-    except ImportError:
-        raise ConfigError('format usd needs usd-core, which is not installed: pip install "lgrasp[usd]"') from None
-    return pxr
+    modules = ("pxr", "Gf", "Sdf", "Tf", "Usd", "UsdGeom")
+    return import_optional("format usd needs usd-core", '"lgrasp[usd]"', *modules, error=ConfigError)
 
 
 class UsdWriter:
