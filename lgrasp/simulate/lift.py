@@ -18,7 +18,6 @@ from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.protocol import GRAVITY, FreeLift, Lift, Protocol, Shake
 from lgrasp.simulate.scene import Scene
-from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.verdict import AXES, Bounds, Look, Verdict, at_rest, chunk_of, moved
 
 if TYPE_CHECKING:
@@ -57,24 +56,18 @@ class Lifted(NamedTuple):
 def check_liftable(protocol: Protocol, scene: Scene, rows: GraspRows) -> None:
     """Raises PhysicsError unless each row has one object and, to lift it off a table, names a plane that this rests
     on, and a way to it."""
-    index = np.asarray(rows.object_index)
-    if protocol.table is None:
-        if index.shape[1] != 1:
-            raise PhysicsError(f"protocol {protocol.name} cannot simulate these grasps: they have several objects")
-        return
-    if not {"pose", "approach"} <= set(rows.table) or any(solid.tables is None for solid in scene.objects):
-        said = "they do not say how the object lies on a table"
-    elif index.shape[1] != 1:
+    index, said, hint = np.asarray(rows.object_index), "", ""
+    if protocol.table:
+        planes = [solid.tables for solid in scene.objects if solid.tables is not None]
+        hint = "; lgrasp generate --table makes such"
+        if not {"pose", "approach"} <= set(rows.table) or len(planes) < len(scene.objects):
+            said = "they do not say how the object lies on a table"
+        elif any((rows.table["pose"][index[:, 0] == k] >= len(known)).any() for k, known in enumerate(planes)):
+            said = "table/pose names a plane that the object does not have"
+    if index.shape[1] != 1:
         said = "they have several objects"
-    elif not all(_known(rows.table["pose"][index[:, 0] == k], solid) for k, solid in enumerate(scene.objects)):
-        said = "table/pose names a plane that the object does not have"
-    else:
-        return
-    raise PhysicsError(f"protocol lift cannot simulate these grasps: {said}; lgrasp generate --table makes such")
-
-
-def _known(pose: np.ndarray, solid: Solid) -> bool:
-    return bool((pose < len(solid.tables if solid.tables is not None else ())).all())
+    if said:
+        raise PhysicsError(f"protocol {protocol.name} cannot simulate these grasps: {said}{hint}")
 
 
 def course_of(

@@ -31,10 +31,9 @@ class Trial:
     Args:
         model: O objects in the order of the rows.
         all_directions: continue after a direction in which the grasp is lost.
-        settled_stop: end a direction early when the objects have come to rest well inside their bounds.
     """
 
-    def __init__(self, model: Model, *, all_directions: bool = False, settled_stop: bool = True) -> None:
+    def __init__(self, model: Model, *, all_directions: bool = False) -> None:
         self._compiled, self._protocol = model, model.protocol
         self._model = model = model.own() if self._protocol.draws else model
         self._near, self._still = MujocoWorld(model, near=True), MujocoWorld(model)
@@ -43,7 +42,7 @@ class Trial:
             from lgrasp.simulate.physx_world import PhysxWorld
 
             self._world = PhysxWorld(model)
-        self._all, self._settled_stop = all_directions, settled_stop
+        self._all = all_directions
         self._timestep = model.mujoco.opt.timestep
         self._chunk = self._steps(chunk_of(self._protocol))
         self._bounds = Bounds(model.protocol)
@@ -147,13 +146,14 @@ class Trial:
         return diverged
 
     def _pull(self, load: np.ndarray, closed: Closed) -> tuple[np.ndarray, float]:
-        """Load the objects in each of T steps, over their forces, (T, 3) [world frame].
+        """Load the objects in each of T steps, over their forces, (T, 3) [world frame]; ends early where they have come
+        to rest well inside their bounds under an even load.
 
         Returns:
             How far each object moved at worst, (O, 2) [m], [rad], and the deepest penetration of any [m].
         """
         worst, depth = closed.moved, closed.depth
-        may_stop = self._settled_stop and bool((load == load[0]).all())
+        may_stop = bool((load == load[0]).all())
         done, before, total = 0, self._moved(), len(load)
         while done < total:
             steps = min(self._chunk, total - done)
