@@ -131,7 +131,6 @@ WRITTEN_BY_HAND = {
     "lgrasp/judge/run.py": "a temporary folder",
     "lgrasp/learn/networks.py": "a network in memory",
     "lgrasp/object/load.py": "reads a scene",
-    "lgrasp/picture/plot.py": "a picture in memory",
     "lgrasp/picture/sheet.py": "a picture in memory",
     "lgrasp/policy/model.py": "a network in memory",
     "lgrasp/runtime/kernel_cache.py": "a temporary folder",
