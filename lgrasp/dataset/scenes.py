@@ -198,14 +198,12 @@ class SceneRows:
 
     def caption(self, row: int, among: Sequence[int]) -> str:
         """What tells a row from others: its number, and hand and objects where these differ."""
-        names = {r: self._names(r) for r in (row, *among)}
+        names = {}
+        for r in (row, *among):
+            hand, objects, _ = self._contents(self.place(r)[0])
+            names[r] = hand.name, " + ".join(o.id for o in objects)
         differing = [k for k in (0, 1) if len({n[k] for n in names.values()}) > 1]
         return " · ".join([*(names[row][k] for k in differing), f"row {row:,}"])
-
-    def _names(self, row: int) -> tuple[str, str]:
-        path, _ = self.place(row)
-        hand, objects, _ = self._contents(path)
-        return hand.name, " + ".join(o.id for o in objects)
 
 
 def draw_rows(rows: SceneRows, chosen: Sequence[int], *, stage: str = "grasp", **options: Any) -> "Image.Image":

@@ -222,7 +222,8 @@ class _Reader:
         """An array from ``_reconstruct(ndarray, (0,), b'b')`` and the state (version, shape, type, Fortran?, data)."""
         _, shape, kind, fortran, data = _exactly(noted.state, 5)
         if isinstance(data, list):
-            _object_type(kind)
+            if _type(kind)[0] not in ("O8", "O4", "O"):
+                raise UnpickleError("an array of objects has another type")
             flat = np.empty(len(data), object)
             for k, item in enumerate(data):
                 flat[k] = self.read(item, depth)
@@ -275,11 +276,6 @@ def _elements(kind: Any, data: Any) -> np.ndarray:
         if ((codes > 0x10FFFF) | ((codes >= 0xD800) & (codes < 0xE000))).any():
             raise UnpickleError("an array of texts holds what is no letter")
     return elements
-
-
-def _object_type(kind: Any) -> None:
-    if _type(kind)[0] not in ("O8", "O4", "O"):
-        raise UnpickleError("an array of objects has another type")
 
 
 def _type(kind: Any) -> tuple[str, str]:
