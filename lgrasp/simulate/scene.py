@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lgrasp.files import temporary_folder
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.decompose import decompose as cut_mesh
-from lgrasp.grasp.hand_files import write_hand
+from lgrasp.grasp.hand_files import checked_urdf
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.geometry import link_pieces
 from lgrasp.hand.piece import Piece
-from lgrasp.hand.urdf import Joint, read_urdf
+from lgrasp.hand.urdf import Joint
 from lgrasp.simulate.solid import Solid, object_of_record
 
 
@@ -59,7 +58,6 @@ def hand_of_record(record: HandRecord, decompose: Decompose, device: str = "cpu"
         ShardError: a mesh that the URDF names is not in the shard.
         HandError: the URDF or a mesh cannot be used.
     """
-    with temporary_folder() as folder:
-        urdf = read_urdf(write_hand(record, folder))
+    with checked_urdf(record) as urdf:
         pieces = {link: link_pieces(urdf, link, decompose, device)[0] for link in urdf.links}
     return HandSolids(record, urdf.joints, pieces)

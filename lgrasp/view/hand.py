@@ -40,7 +40,7 @@ class HandView(View):
         self._server, self._source, self._model, self._tree = server, source, model, model.tree
         self._lock = threading.RLock()
         self._shown: dict[str, _Nodes] = {}
-        shape = HandShape(source.urdf, self._tree.base_link, self._tree.listed_names)
+        shape = HandShape(read_urdf(source.urdf), self._tree.base_link, self._tree.listed_names)
         self._figure = HandFigure(server.scene, "/hand", shape)
         gui = server.gui
         gui.add_markdown(f"**{model.name}** {source.spec.description}")
