@@ -67,11 +67,11 @@ def read_dexgraspbench(path: Path | str, *, joint_names: Sequence[str] | None = 
             if not len(names):
                 raise ShardError(f"{file}: does not name its joints; give joint_names")
             postures = np.stack([numbers(entry[key], key, 7 + len(names)) for key in _POSTURES])
-            world, mesh = numbers(entry["obj_pose"], "obj_pose", 1, 7), entry["obj_path"]
-            if not world[:, 3:].any() or not postures[0, 3:7].any():
+            world, mesh = numbers(entry["obj_pose"], "obj_pose", 7), entry["obj_path"]
+            if not world[3:].any() or not postures[0, 3:7].any():
                 raise ValueError("a quaternion is 0 0 0 0; one of unit length is accepted")
             if not isinstance(mesh, str):
-                raise ValueError(f"obj_path is {mesh!r}; expected is the path of a mesh")
-            root = compose(inverse(world), postures[:1, :7])
-            folder.add(file, names, postures[:, 7:], root, Path(mesh).stem, numbers(entry["obj_scale"], "obj_scale"))
+                raise ValueError(f"obj_path is {mesh!r}, expected the path of a mesh")
+            root = compose(inverse(world), postures[0, :7])
+            folder.add(file, names, postures[:, 7:], root, Path(mesh).stem, entry["obj_scale"])
     return folder.grasps()

@@ -60,6 +60,7 @@ def read_dexgraspnet(path: Path | str, *, joint_names: Sequence[str] | None = No
             where = f"{file}: entry {number}"
             with parsing(where, "a grasp of DexGraspNet", WRONG):
                 names = [name for name in entry["qpos"] if name not in _WRIST]
+                folder.order(where, names)
                 values = [[entry.get(key, entry["qpos"])[name] for name in (*_WRIST, *names)] for key in _POSTURES]
                 table = numbers(values, "qpos", 3, 6 + len(names))
                 pose = np.concatenate([table[0, :3], quaternion_from_euler(table[0, 3:6])])

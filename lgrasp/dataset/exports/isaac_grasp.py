@@ -79,6 +79,7 @@ def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = No
         for name, entry in grasps:
             with parsing(where := f"{file}: {name}", "a grasp of isaac_grasp 1.0", WRONG):
                 turn, joints = entry["orientation"], entry["cspace_position"]
+                folder.order(where, joints)
                 q = [[entry.get(key, joints)[joint] for joint in joints] for key in CSPACE_POSTURES]
                 folder.add(where, joints, q, (*entry["position"], turn["w"], *turn["xyz"]), file.stem)
     return folder.grasps(of_base=True)

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,17 +44,22 @@ WRONG = (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionE
 
 
 def numbers(values: Any, what: str, *shape: int) -> np.ndarray:
-    """Finite numbers as float64 in some shape; -1: of any length.
+    """Finite numbers as float64 in some shape, none: one number; -1: of any length.
 
     Raises:
         ValueError: They are none, or too many or too few.
     """
-    with suppress(TypeError, ValueError):
-        found = np.asarray(values, np.float64).reshape(shape)
-        if np.isfinite(found).all():
-            return found
-    wanted = " x ".join(str(size) if size >= 0 else "n" for size in shape)
-    raise ValueError(f"{what} is {str(values)[:60]}; expected are {wanted} finite numbers")
+    try:
+        found = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} holds no numbers: {error}") from None
+    if not np.isfinite(found).all():
+        raise ValueError(f"{what} is not finite")
+    try:
+        return found.reshape(shape)
+    except ValueError:
+        expected = " x ".join(str(size) if size >= 0 else "n" for size in shape) or "1"
+        raise ValueError(f"{what} has {found.size} numbers, expected {expected}") from None
 
 
 def order_of(names: Sequence[str], wanted: Sequence[str], where: object) -> list[int]:
@@ -89,6 +93,12 @@ class ExportFolder:
     """Those that grasps named so far."""
     _added: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)  # q, pose and object's place
 
+    def order(self, where: object, names: Iterable[Any]) -> list[int]:
+        """As :func:`order_of` the joints that are wanted."""
+        listed = tuple(map(str, names))
+        self.wanted = self.wanted or listed
+        return order_of(listed, self.wanted, where)
+
     def add(self, where: object, names: Iterable[Any], q: Any, pose: Any, code: str, scale: Any = 1.0) -> None:
         """Take up n grasps of one object.
 
@@ -104,13 +114,12 @@ class ExportFolder:
             ShardError: The joints are others than those wanted.
             ValueError: Not so many finite numbers, or a quaternion of length 0.
         """
-        listed = tuple(map(str, names))
-        self.wanted = self.wanted or listed
-        order = order_of(listed, self.wanted, where)
-        q, pose = numbers(q, "joints", -1, 3, len(order))[..., order], numbers(pose, "pose", -1, 7)
+        order = self.order(where, names)
+        q = numbers(q, "joints", -1, 3, len(order))[..., order]
+        pose, scale = numbers(pose, "pose", len(q), 7), float(numbers(scale, "scale"))
         if not pose[:, 3:].any(axis=1).all():
             raise ValueError("a quaternion is 0 0 0 0; one of unit length is accepted")
-        self._added.append((q, pose, np.full((len(q), 1), self.place(code, float(scale)))))
+        self._added.append((q, pose, np.full((len(q), 1), self.place(code, scale))))
 
     def place(self, code: str, scale: float = 1.0) -> int:
         """Place of an object in ``objects``, which it is added to if it is not there."""
