@@ -54,7 +54,7 @@ class HandView(View):
         with gui.add_folder("show"):
             for name in list(self._layers)[:4]:
                 box = gui.add_checkbox(name, name == "contact patches")
-                box.on_update(lambda event, name=name: self.show(name, event.target.value))
+                box.on_update(partial(self._ticked, name))
             surface = gui.add_checkbox("surface", True)
             surface.on_update(lambda _: show_all(self._figure.meshes.values(), surface.value))
             spaces = gui.add_dropdown("opposition space", (_NONE, *source.spec.opposition_spaces), initial_value=_NONE)
@@ -110,6 +110,9 @@ class HandView(View):
             if visible:
                 self._shown[layer] = self._layers[layer]()
             return len(self._shown.get(layer, []))
+
+    def _ticked(self, layer: str, event: "viser.GuiEvent") -> None:
+        self.show(layer, event.target.value)
 
     def _space(self, name: str) -> None:
         """Show the sides of one space, or of none."""
