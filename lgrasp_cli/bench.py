@@ -132,10 +132,10 @@ def table1(
     from lgrasp.bench.charts import draw_table
     from lgrasp.bench.comparison import new_table, read_table, without_missing
     from lgrasp.bench.page import load_published
-    from lgrasp.picture.plot import check_plot
+    from lgrasp.picture.sheet import check_image
 
     if plot:
-        check_plot(plot)
+        check_image(plot, (".png",))
     if not objects:
         config, missing = without_missing(config)
         if missing:

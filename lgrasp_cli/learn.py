@@ -228,9 +228,9 @@ def show(
     report, curves = data["report"], data["report"].get("curves", {})
     if plot:
         from lgrasp.learn.curve import draw_curves
-        from lgrasp.picture.plot import check_plot
+        from lgrasp.picture.sheet import check_image
 
-        check_plot(plot)
+        check_image(plot, (".png",))
         if not curves:
             raise ConfigError(f"{data['file']}: its card has no curve; networks trained with this version have one")
         draw_curves(curves, f"{data['name']}: {data['kind']}, {data['hand']}", plot)

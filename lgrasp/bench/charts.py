@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from lgrasp.picture.plot import write_plot
+from lgrasp.picture.sheet import write_plot
 
 _COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#9467bd")
 _PUBLISHED = "#b0b0b0"

@@ -20,15 +20,13 @@ def tell_difference(
 ) -> str:
     """``seed: 0 there, 5 requested`` for the first of the names whose texts differ; "" if none do."""
     names = [name for name in names if old.get(name) != new.get(name)]
-    words = [_words(name, old.get(name, absent[0]), new.get(name, absent[1]), sides) for name in names[:_MOST_SHOWN]]
+    words = []
+    for name in names[:_MOST_SHOWN]:
+        pair = old.get(name, absent[0]), new.get(name, absent[1])
+        shown = f"{name}: {pair[0]} {sides[0]}, {pair[1]} {sides[1]}"
+        words.append(shown if max(map(len, pair)) <= _MOST_LETTERS else f"{name} differs")
     more = len(names) - _MOST_SHOWN
     return ", ".join([*words, *([f"{more} more"] if more > 0 else [])])
-
-
-def _words(name: str, old: str, new: str, sides: tuple[str, str]) -> str:
-    if max(len(old), len(new)) > _MOST_LETTERS:
-        return f"{name} differs"
-    return f"{name}: {old} {sides[0]}, {new} {sides[1]}"
 
 
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 import h5py
 import numpy as np
 
-from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.reader import open_hdf5, reading
-from lgrasp.dataset.writer import create_rows, finish
+from lgrasp.dataset.writer import create_rows, finish, new_shard_file
 from lgrasp.errors import ShardError
 
 

@@ -26,7 +26,8 @@ def parsing(path: str | os.PathLike[str], what: str = "", kinds: tuple[type[Exce
     except OSError as error:
         raise ShardError(f"{error.filename or path}: {error.strerror or error}") from error
     except kinds as error:
-        raise ShardError(f"{path}: not {what}: {short_reason(error)}") from error
+        reason = f"it has no {error}" if isinstance(error, KeyError) else short_reason(error)
+        raise ShardError(f"{path}: not {what}: {reason}") from error
 
 
 def check_regular(path: str | os.PathLike[str]) -> None:

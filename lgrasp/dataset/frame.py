@@ -7,6 +7,7 @@ import numpy as np
 
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.records import GraspRows, ObjectRecord
+from lgrasp.runtime.optional import import_optional
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,10 +31,7 @@ def grasp_frame(rows: GraspRows, joints: Sequence[str], objects: Sequence[Object
     Raises:
         ConfigError: pandas is not installed.
     """
-    try:
-        import pandas as pd
-    except ImportError:
-        raise ConfigError("to_pandas needs pandas, which is not installed: pip install pandas") from None
+    pd = import_optional("to_pandas needs pandas", "pandas", "pandas", error=ConfigError)
     index = rows.object_index
     named = [" + ".join(objects[k].name for k in slots if k >= 0) for slots in index]
     columns: dict[str, object] = {"objects": np.array(named, object)}

@@ -219,7 +219,11 @@ def update_manifest(folder: Path, change: Callable[[Manifest], None]) -> None:
         raise OutputError(f"cannot write {path}: it is no file; remove it")
     with locked(path):
         try:
-            manifest = _read_or_say(path)
+            try:
+                manifest = read_manifest(path)
+            except ShardError as error:
+                notice(f"{error}; writing it again")
+                manifest = None
             before = manifest and manifest.text()
             manifest = manifest or Manifest(runs=listed_there(folder))
             change(manifest)
@@ -230,14 +234,6 @@ def update_manifest(folder: Path, change: Callable[[Manifest], None]) -> None:
         finally:
             if path.exists() and not path.stat().st_size:
                 path.unlink()
-
-
-def _read_or_say(path: Path) -> Manifest | None:
-    try:
-        return read_manifest(path)
-    except ShardError as error:
-        notice(f"{error}; writing it again")
-        return None
 
 
 def listed_there(folder: Path) -> list[ListedRun]:

@@ -13,9 +13,8 @@ from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.difference import NO_REASON, leaves, tell_difference
 from lgrasp.dataset.files import Paths, check_heaps, find_shards
 from lgrasp.dataset.manifest import MANIFEST, compare, read_manifest
-from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.writer import column_texts, create_rows, finish, write_context
+from lgrasp.dataset.writer import column_texts, create_rows, finish, new_shard_file, write_context
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.records import GraspRows, HandRecord, Shard, ShardHeader, padded
 from lgrasp.grasp.schema import CHUNK_ROWS, GRASP_FIELDS, SEQUENCE_FIELDS, TABLE_FIELDS

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -198,34 +198,19 @@ class SceneRows:
 
     def caption(self, row: int, among: Sequence[int]) -> str:
         """What tells a row from others: its number, and hand and objects where these differ."""
-        names = {r: self._names(r) for r in (row, *among)}
+        names = {}
+        for r in (row, *among):
+            hand, objects, _ = self._contents(self.place(r)[0])
+            names[r] = hand.name, " + ".join(o.id for o in objects)
         differing = [k for k in (0, 1) if len({n[k] for n in names.values()}) > 1]
         return " · ".join([*(names[row][k] for k in differing), f"row {row:,}"])
 
-    def _names(self, row: int) -> tuple[str, str]:
-        path, _ = self.place(row)
-        hand, objects, _ = self._contents(path)
-        return hand.name, " + ".join(o.id for o in objects)
 
-
-def draw_rows(
-    rows: SceneRows,
-    chosen: Sequence[int],
-    *,
-    stage: str = "grasp",
-    size: int,
-    columns: int = 0,
-    loading: Callable[[str, float], None] | None = None,
-) -> "Image.Image":
-    """Rows side by side, each with its number; arguments as those of :func:`draw_motion`.
-
-    Args:
-        stage: pregrasp, grasp or squeeze.
-    """
+def draw_rows(rows: SceneRows, chosen: Sequence[int], *, stage: str = "grasp", **options: Any) -> "Image.Image":
+    """Rows side by side at a stage: pregrasp, grasp or squeeze; options and errors as of :func:`draw_motion`."""
     from lgrasp.picture.scene import STAGES  # slow to load
 
-    times = [list(STAGES).index(stage)]
-    return draw_motion(rows, chosen, times, size=size, columns=columns, loading=loading)[0]
+    return draw_motion(rows, chosen, [list(STAGES).index(stage)], **options)[0]
 
 
 def draw_motion(

@@ -51,30 +51,27 @@ class Split(JsonFile):
         """
         if part not in self.parts:
             raise ConfigError(f"no part '{part}' in the split; it has {', '.join(self.parts)}")
+        return self.numbers(reader) == list(self.parts).index(part)
+
+    def numbers(self, reader: ShardReader) -> np.ndarray:
+        """The part that each row of a shard is in, counted in ``parts``, shape [N]; -1 for a row without an object.
+
+        Raises:
+            ShardError: the split does not know an object, or the hand.
+        """
         if self.by == "pose":
-            numbers, parts = _pose_numbers(reader, self.seed), list(self.parts)
-            above = [self.parts[name].upto for name in parts[: parts.index(part)]][-1:]
-            return (numbers <= self.parts[part].upto) & np.all([numbers > low for low in above], axis=0)
-        of = {sha256: name for name, told in self.parts.items() for sha256 in told.sha256}
+            ends = np.array([told.upto for told in self.parts.values()], np.uint64)
+            return np.searchsorted(ends, _pose_numbers(reader, self.seed))
+        of = {sha256: number for number, told in enumerate(self.parts.values()) for sha256 in told.sha256}
         if self.by == "hand":
-            groups, place = (
-                [(str(reader.attributes["hand"]), str(reader.attributes["hand_sha256"]))],
-                np.zeros(len(reader), int),
-            )
+            attributes, place = reader.attributes, np.zeros(len(reader), int)
+            groups = [(str(attributes["hand"]), str(attributes["hand_sha256"]))]
         else:
             groups, place = [key[:2] for key in reader.object_keys], _first(reader)
         for k in np.unique(place[place >= 0]):
             if groups[k][1] not in of:
                 raise ShardError(f"{reader.path}: {self.by} '{groups[k][0]}' is in no part of the split")
-        return np.array([*(of.get(sha256) == part for _, sha256 in groups), False])[place]
-
-    def numbers(self, reader: ShardReader) -> np.ndarray:
-        """The part that each row of a shard is in, counted in ``parts``, shape [N].
-
-        Raises:
-            ShardError: the split does not know an object, or the hand.
-        """
-        return np.argmax([self.holds(part, reader) for part in self.parts], axis=0)
+        return np.array([*(of.get(sha256, -1) for _, sha256 in groups), -1])[place]
 
 
 class Groups(NamedTuple):

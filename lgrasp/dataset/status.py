@@ -1,6 +1,6 @@
 """How far the runs are whose files are in some folders, by their manifests."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,6 @@ from lgrasp.dataset.manifest import (
     SUFFIX,
     Differences,
     ListedRun,
-    ListedShard,
     compare,
     read_manifest,
     workers,
@@ -50,18 +49,12 @@ def folder_states(paths: Iterable[Path], *, verify: bool = False) -> list[dict[s
     for path in paths:
         if not path.is_dir():
             raise ShardError(f"{path}: no such folder")
-        for folder in _folders(path):
-            found += _states(folder, working, verify)
+        for folder, files in walk(path, hidden=False):
+            if any(file == MANIFEST or file.endswith(SUFFIX) for file in files):
+                found += _states(folder, working, verify)
     if not found:
         raise ShardError(f"no {MANIFEST} and no shard (*{SUFFIX}) in {', '.join(map(str, paths))}")
     return found
-
-
-def _folders(top: Path) -> Iterator[Path]:
-    """Folders with a manifest or shards; hidden ones are left out."""
-    for folder, files in walk(top, hidden=False):
-        if any(file == MANIFEST or file.endswith(SUFFIX) for file in files):
-            yield folder
 
 
 def _states(folder: Path, working: Any, verify: bool) -> list[dict[str, Any]]:
@@ -94,7 +87,8 @@ def _state(folder: Path, run: ListedRun, found: Differences, working: Any) -> di
     elif missing:
         state = "incomplete"
     else:
-        state = "starved" if any(map(_starved, there)) else "complete"
+        starved = any(shard.asked is not None and (shard.rows or 0) < shard.asked for shard in there)
+        state = "starved" if starved else "complete"
     asked = [shard.asked for shard in run.shards if shard.asked is not None]
     return {
         "folder": str(folder),
@@ -109,7 +103,3 @@ def _state(folder: Path, run: ListedRun, found: Differences, working: Any) -> di
         "state": state,
         "next": _NEXT.get(state, "").format(job=run.job),
     }
-
-
-def _starved(shard: ListedShard) -> bool:
-    return shard.asked is not None and (shard.rows or 0) < shard.asked

@@ -52,44 +52,42 @@ def whole_problems(
     file: h5py.File, name: str, form: str, version: str, structure: Callable[[dict[str, Any]], list[str]]
 ) -> list[str]:
     """Why a file is no whole file of a format, one line each; ``structure`` tells what its :func:`members` lack."""
-    nodes: dict[str, Any] = {}
-    return format_problems(file, name, form, version) or _foreign_problems(file, nodes) or structure(nodes)
+    if problems := format_problems(file, name, form, version):
+        return problems
+    nodes, problem = _walk(file)
+    return [problem] if problem else structure(nodes)
 
 
 def members(file: h5py.File) -> dict[str, Any]:
     """The groups and datasets of a file that leads to no other, by path; "" is the file."""
-    nodes: dict[str, Any] = {}
-    _foreign_problems(file, nodes)
-    return nodes
+    return _walk(file)[0]
 
 
-def _foreign_problems(file: h5py.File, nodes: dict[str, Any]) -> list[str]:
-    """What makes a file more than its own bytes, or larger than them: one line, empty when there is nothing.
+def _walk(file: h5py.File) -> tuple[dict[str, Any], str]:
+    """As :func:`members`, until something makes a file more than its own bytes, or larger than them, and what; "" when
+    there is nothing.
 
     Links and datasets that lead to other files, groups inside each other without end, sizes that are only declared, and
     names that could not be those of files.
-
-    Args:
-        nodes: gets what :func:`members` gives.
     """
-    nodes[""] = file
+    nodes: dict[str, Any] = {"": file}
     todo: list[tuple[str, h5py.Group, int]] = [("", file, 1)]
     while todo:
         path, group, depth = todo.pop()
         for name in group:
             here = f"{path}{name}"
             if name_problem(name):
-                return [f"{here!r}: the name cannot be used: {name_problem(name)}"]
+                return nodes, f"{here!r}: the name cannot be used: {name_problem(name)}"
             if group.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
-                return [f"{here}: is a link; the file must hold its own data"]
+                return nodes, f"{here}: is a link; the file must hold its own data"
             nodes[here] = node = _member(group, name)
             if isinstance(node, h5py.Group):
                 if depth == _MOST_GROUPS:
-                    return [f"{here}: more than {_MOST_GROUPS} groups inside each other"]
+                    return nodes, f"{here}: more than {_MOST_GROUPS} groups inside each other"
                 todo.append((f"{here}/", node, depth + 1))
             elif isinstance(node, h5py.Dataset) and (problem := _foreign_data(node)):
-                return [f"{here}: {problem}"]
-    return []
+                return nodes, f"{here}: {problem}"
+    return nodes, ""
 
 
 def _member(group: h5py.Group, name: str) -> Any:

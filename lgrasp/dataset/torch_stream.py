@@ -8,7 +8,7 @@ import torch
 
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.split import Split
-from lgrasp.dataset.torch_rows import TorchRows
+from lgrasp.dataset.torch_dataset import TorchRows
 from lgrasp.grasp.schema import CHUNK_ROWS
 
 Rows = dict[str, torch.Tensor]
@@ -23,7 +23,7 @@ class GraspIterableDataset(TorchRows, torch.utils.data.IterableDataset):
     training (of ``torch.distributed``, or ``rank`` of ``ranks``) share the rows evenly, to one row.
 
     Args:
-        paths, columns, negatives, split, part: as of :class:`~lgrasp.dataset.torch_rows.TorchRows`.
+        paths, columns, negatives, split, part: as of :class:`~lgrasp.dataset.torch_dataset.TorchRows`.
         batch: Rows of a batch, for ``DataLoader(data, batch_size=None)``, many times as fast as collating rows; 0: rows
             one by one.
         buffer: Rows among which each next one is drawn, per worker process; 0: rows in the order of the shards.

@@ -1,9 +1,10 @@
-"""Writes one whole shard, or nothing."""
+"""Writes one whole shard, or nothing, on full disks too."""
 
+import io
 import json
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,9 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
-from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.structure import members, structure_problems, text_sha256
 from lgrasp.errors import ShardError
-from lgrasp.files import locked
+from lgrasp.files import locked, new_file
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, object_set_sha256
 from lgrasp.grasp.schema import (
     CHUNK_ROWS,
@@ -27,6 +27,56 @@ from lgrasp.grasp.schema import (
     DatasetSpec,
 )
 from lgrasp.paths import name_problem
+
+_LIBVER = ("v110", "v110")  # readable since HDF5 1.10; its metadata blocks carry checksums, the older layout's do not
+
+
+class _Sink(io.FileIO):
+    """Binary file for HDF5 that remembers the first write error instead of raising it.
+
+    The HDF5 library aborts the process when a write fails while it closes a file (disk full). Here it sees every
+    write succeed, closes in peace, and :func:`new_shard_file` reports the error afterwards.
+    """
+
+    error: OSError | None = None
+
+    def readinto(self, buffer) -> int:
+        n = super().readinto(buffer) or 0
+        buffer[n:] = bytes(len(buffer) - n)  # only short after a failed write
+        return len(buffer)
+
+    def write(self, data) -> int:
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view) and self.error is None:
+            try:
+                done += super().write(view[done:]) or 0
+            except OSError as error:
+                self.error = error
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        if self.error is None:
+            try:
+                super().truncate(size)
+            except OSError as error:
+                self.error = error
+        return size or 0
+
+
+@contextmanager
+def new_shard_file(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+    """An empty HDF5 file, open for writing, that appears as ``path`` only when the block ends without an error.
+
+    Raises:
+        OutputError: As :func:`new_file`.
+    """
+    with new_file(path) as raw:
+        sink = _Sink(raw.fileno(), "r+", closefd=False)
+        with h5py.File(sink, "w", libver=_LIBVER) as file:
+            yield file
+        if sink.error is not None:
+            raise sink.error
 
 
 def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
@@ -126,12 +176,10 @@ def _write_object(group: h5py.Group, record: ObjectRecord) -> None:
     )
     create_array(group, "vertices", record.vertices, "f4")
     create_array(group, "faces", record.faces, "i4")
-    if record.normals is not None:
-        create_array(group, "normals", record.normals, "f4")
-    if record.tables is not None:
-        create_array(group, "tables", record.tables, "f4")
+    for name in ("normals", "tables", "regions"):
+        if (values := getattr(record, name)) is not None:
+            create_array(group, name, values, "f4")
     if record.regions is not None:
-        create_array(group, "regions", record.regions, "f4")
         group.attrs["touch_share"] = float(record.touch_share)
 
 

@@ -1,10 +1,28 @@
 """The hand of a shard as files that are read like any other hand's."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from lgrasp.errors import ShardError
+from lgrasp.errors import HandError, ShardError
+from lgrasp.files import temporary_folder
 from lgrasp.grasp.records import HandRecord
-from lgrasp.hand.urdf import mesh_place, parse_robot
+from lgrasp.hand.urdf import Urdf, mesh_place, parse_robot, read_urdf
+
+
+@contextmanager
+def checked_urdf(record: HandRecord) -> Iterator[Urdf]:
+    """The URDF of a hand; its mesh files are there while the block runs.
+
+    Raises:
+        ShardError: as of :func:`write_hand`.
+        HandError: the URDF or a mesh cannot be used.
+    """
+    with temporary_folder() as folder:
+        try:
+            yield read_urdf(write_hand(record, folder))
+        except HandError as error:
+            raise HandError(str(error).replace(f"{folder}/", "")) from None
 
 
 def write_hand(record: HandRecord, folder: Path) -> Path:

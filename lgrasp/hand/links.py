@@ -1,10 +1,19 @@
 """Where the links of a URDF are, from joint values alone."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from lgrasp.hand.urdf import Urdf
+from lgrasp.hand.urdf import Joint, Urdf
+
+
+def joints_above(joints: Iterable[Joint], link: str) -> list[Joint]:
+    """The joints between a link and the root, from the link up."""
+    into, found = {joint.child: joint for joint in joints}, []
+    while link in into:
+        found.append(into[link])
+        link = found[-1].parent
+    return found
 
 
 def link_poses(urdf: Urdf, base_link: str, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

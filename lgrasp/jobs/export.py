@@ -92,7 +92,7 @@ class ExportJob(ExportRequest, Job):
     def _cut(self) -> Cut:
         """Convex pieces of objects as the simulation makes them, from the cache; approximations are reported."""
         from lgrasp.geometry.decompose import decompose
-        from lgrasp.simulate.scene import object_of_record
+        from lgrasp.simulate.solid import object_of_record
 
         def cut(record: ObjectRecord) -> Sequence[np.ndarray]:
             solid = object_of_record(record, partial(decompose, store=self.cache))

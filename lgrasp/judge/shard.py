@@ -159,22 +159,19 @@ def read_object(group: h5py.Group, source: Path | None) -> tuple[JudgedObject, s
     return _cached(key, lambda: JudgedObject(clean_mesh(vertices, faces))), key
 
 
-def read_tables(group: h5py.Group) -> np.ndarray:
-    """Planes that an object rests on, (T, 5); none where the shard tells none."""
-    tables = _array(group, "tables") if "tables" in group else np.zeros((0, 5))
-    if tables.ndim != 2 or tables.shape[1] != 5 or tables.dtype.kind != "f":
-        raise JudgeError(f"{group.name}/tables: {tables.dtype} of shape {tables.shape}, not numbers of shape (T, 5)")
-    return tables.astype(float)
+def _fives(group: h5py.Group, name: str) -> np.ndarray:
+    """A dataset of five numbers a row, (n, 5); none where it is not there."""
+    found = _array(group, name) if name in group else np.zeros((0, 5))
+    if found.ndim != 2 or found.shape[1] != 5 or found.dtype.kind != "f":
+        raise JudgeError(f"{group.name}/{name}: {found.dtype} of shape {found.shape}, not numbers of shape (n, 5)")
+    return found.astype(float)
 
 
 def read_regions(group: h5py.Group) -> JudgedRegions | None:
     """What of an object must be touched and avoided; None where the shard tells nothing."""
     if "regions" not in group:
         return None
-    points, share = _array(group, "regions"), float(group.attrs.get("touch_share", 1.0))
-    if points.ndim != 2 or points.shape[1] != 5 or not len(points) or points.dtype.kind != "f":
-        raise JudgeError(f"{group.name}/regions: {points.dtype} of shape {points.shape}, not numbers of shape (S, 5)")
-    return JudgedRegions(points.astype(float), share)
+    return JudgedRegions(_fives(group, "regions"), float(group.attrs.get("touch_share", 1.0)))
 
 
 def read_shard(path: Path, urdf: Path | None = None, mesh: Mapping[str, Path] | None = None) -> JudgedShard:
@@ -237,7 +234,7 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         grasps=grasps,
         steps=steps,
         table=table,
-        tables=[read_tables(f["objects"][name]) for name in objects],
+        tables=[_fives(f["objects"][name], "tables") for name in objects],
         regions=[read_regions(f["objects"][name]) for name in objects],
         metrics=metrics,
         kept_invalid=columns["valid"] == 0 if "valid" in columns else np.zeros(sizes["N"], bool),

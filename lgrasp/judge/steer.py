@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from lgrasp.judge import bounds
 from lgrasp.judge.bounds import REGION_WEIGHT, JudgeError
 from lgrasp.judge.collision import JudgedHand, JudgedObject, hand_in_object
+from lgrasp.judge.hand import pose_transforms
 
 COSINE_SLACK = 1e-4
 """Of the palm's direction outside its cone."""
@@ -135,10 +136,7 @@ def _matrices(poses: np.ndarray) -> np.ndarray:
     """Poses x y z qw qx qy qz, (T, 7), as (T, 4, 4)."""
     if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all():
         raise ValueError(f"poses of shape {poses.shape} are none")
-    T = np.tile(np.eye(4), (len(poses), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(poses[:, 3:], scalar_first=True).as_matrix()
-    T[:, :3, 3] = poses[:, :3]
-    return T
+    return pose_transforms(poses[:, :3], Rotation.from_quat(poses[:, 3:], scalar_first=True))
 
 
 def _comparable(T: np.ndarray) -> np.ndarray:
@@ -157,12 +155,12 @@ class JudgedRegions:
     """Surface points (S, 3) with their weights in what is to be touched and to be avoided, as rows (S, 5).
 
     Raises:
-        JudgeError: numbers that are not finite, or a share out of range.
+        JudgeError: no points, numbers that are not finite, or a share out of range.
     """
 
     def __init__(self, points: np.ndarray, share: float) -> None:
-        if not np.isfinite(points).all() or not 0.0 < share <= 1.0:
-            raise JudgeError(f"regions: numbers that are not finite, or share {share:g}, which is not in (0, 1]")
+        if not len(points) or not np.isfinite(points).all() or not 0.0 < share <= 1.0:
+            raise JudgeError(f"regions: no points, numbers that are not finite, or share {share:g} outside of (0, 1]")
         self.tree = cKDTree(points[:, :3])
         self.touch, self.avoid = (points[:, k] >= REGION_WEIGHT for k in (3, 4))
         self.share = share

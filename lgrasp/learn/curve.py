@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from lgrasp.picture.plot import write_plot
+from lgrasp.picture.sheet import write_plot
 
 POINTS = 100
 """Of a curve at most."""

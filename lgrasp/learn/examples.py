@@ -10,9 +10,8 @@ from lgrasp.geometry.poses import pose_matrix
 from lgrasp.hand.model import HandModel
 from lgrasp.learn.params import LearnParams
 from lgrasp.object.model import ObjectModel
-from lgrasp.picture.camera import look_at
+from lgrasp.picture.camera import central_camera, look_at
 from lgrasp.picture.depth import LabelledMesh, render
-from lgrasp.scenes.camera import intrinsics_of
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.records import CloudRecord
 from lgrasp.scenes.render import add_noise, draw_offsets, merge_views
@@ -100,12 +99,13 @@ def seen_cloud(
     """What the cameras see of a mesh alone in space, from random sides, about the origin of its vertices [m]."""
     radius = float(np.linalg.norm(vertices, axis=1).max())
     surface = LabelledMesh(vertices, faces, np.zeros(len(faces)))
+    lens = central_camera(camera.width, camera.height, camera.angle)
     while True:
         way = rng.standard_normal((camera.views, 3))
         way /= np.linalg.norm(way, axis=1)[:, None]
         if np.abs(way[:, 2]).max() > 0.98:  # no upright image
             continue
-        images = render(surface, intrinsics_of(camera), look_at(_CAMERA_DISTANCE * radius * way, np.zeros(3)), device)
+        images = render(surface, lens, look_at(_CAMERA_DISTANCE * radius * way, np.zeros(3)), device)
         merged = merge_views(add_noise(images, camera, rng), draw_offsets(camera, rng), camera, device)
         if len(merged.points) >= _LEAST_POINTS:
             return merged

@@ -106,8 +106,8 @@ def framing(points: np.ndarray, way: np.ndarray) -> np.ndarray:
     return look_at((target + far * way)[None], target)
 
 
-def draw(painted: Sequence[Painted], dots: np.ndarray, view: Viewpoint, background: str = "#ffffff") -> np.ndarray:
-    """What a camera sees: sRGB, shape (h, w, 3), uint8.
+def draw(painted: Sequence[Painted], dots: np.ndarray, view: Viewpoint) -> np.ndarray:
+    """What a camera sees, white behind all: sRGB, shape (h, w, 3), uint8.
 
     Args:
         dots: points that are seen through everything [m], shape (n, 3).
@@ -130,8 +130,7 @@ def draw(painted: Sequence[Painted], dots: np.ndarray, view: Viewpoint, backgrou
         light.above, light.below = wp.vec3(0.50, 0.52, 0.55), wp.vec3(0.28, 0.26, 0.25)
         light.samples, light.rays, light.through = _SAMPLES, _RAYS, _THROUGH
         out = wp.empty((intrinsics.height, intrinsics.width), dtype=wp.vec3)
-        ground = wp.vec3(*map(float, _linear([background])[0]))
-        wp.launch(kernels.shade, out.shape, [solids, marks, camera, light, ground], [out])
+        wp.launch(kernels.shade, out.shape, [solids, marks, camera, light, wp.vec3(1.0, 1.0, 1.0)], [out])
         colour = np.clip(to_numpy(out), 0, 1)
     del mesh, dot_mesh  # kept alive until here
     srgb = np.where(colour < 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
@@ -157,8 +156,14 @@ def _upload(painted: Sequence[Painted]) -> tuple[Any, wp.Mesh]:
     return solids, mesh
 
 
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue, 0 to 255, of a colour such as #ff8800."""
+    r, g, b = bytes.fromhex(colour[1:])
+    return r, g, b
+
+
 def _linear(colours: Sequence[str]) -> np.ndarray:
     """Linear colours (n, 3) of sRGB ones such as #ff8800."""
     names, which = np.unique(np.asarray(colours), return_inverse=True)
-    srgb = np.array([[int(name[i : i + 2], 16) / 255 for i in (1, 3, 5)] for name in names])
+    srgb = np.array([rgb(name) for name in names]) / 255
     return np.where(srgb < 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)[which.ravel()]

@@ -3,21 +3,19 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
-from lgrasp.errors import HandError, ShardError
+from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import pose_matrix
-from lgrasp.grasp.hand_files import write_hand
+from lgrasp.grasp.hand_files import checked_urdf
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 from lgrasp.hand.geometry import geometry_mesh, thin_mesh
 from lgrasp.hand.links import link_poses
 from lgrasp.hand.surface import joined_mesh
-from lgrasp.hand.urdf import read_urdf
+from lgrasp.hand.urdf import Urdf
 
 _SHARP = 0.8  # least cosine between a face and its corner's mean normal; edges of less are sharp
 _MOST_FACES = 8000  # of a link
@@ -29,21 +27,20 @@ class HandShape:
     """The links of a hand and how they move.
 
     Args:
-        urdf: file; its meshes are read at once.
+        urdf: its meshes are read at once.
         base_link: link whose frame poses are given in.
         joint_names: columns of q, length K.
 
     Raises:
-        HandError: the URDF or a mesh cannot be used.
+        HandError: a mesh cannot be used.
     """
 
-    def __init__(self, urdf: Path, base_link: str, joint_names: Sequence[str]) -> None:
-        self._urdf = read_urdf(urdf)
-        self._base, self._columns = base_link, tuple(joint_names)
+    def __init__(self, urdf: Urdf, base_link: str, joint_names: Sequence[str]) -> None:
+        self._urdf, self._base, self._columns = urdf, base_link, tuple(joint_names)
         self.links: dict[str, trimesh.Trimesh] = {}
         """Surfaces in link frames [m], of links that have one."""
-        for link, geometries in self._urdf.links.items():
-            parts = [geometry_mesh(self._urdf, g).apply_transform(g.T_link_geometry) for g in geometries]
+        for link, geometries in urdf.links.items():
+            parts = [geometry_mesh(urdf, g).apply_transform(g.T_link_geometry) for g in geometries]
             if parts:
                 self.links[link] = thin_mesh(joined_mesh(parts), _MOST_FACES)
 
@@ -55,15 +52,11 @@ class HandShape:
             ShardError: a mesh is missing, or the base link or a joint is not in the URDF.
             HandError: the URDF or a mesh cannot be used.
         """
-        with TemporaryDirectory(prefix="lgrasp-hand-") as folder:
-            try:
-                shape = cls(write_hand(record, Path(folder)), record.base_link, record.joint_names)
-            except HandError as error:
-                raise HandError(str(error).replace(f"{folder}/", "")) from None
-        joints = {joint.name for joint in shape._urdf.joints}
-        for name in [*({record.base_link} - set(shape._urdf.links)), *(set(record.joint_names) - joints)]:
-            raise ShardError(f"hand '{record.name}': its URDF has no link or joint {name!r}")
-        return shape
+        with checked_urdf(record) as urdf:
+            joints = {joint.name for joint in urdf.joints}
+            for name in [*({record.base_link} - set(urdf.links)), *(set(record.joint_names) - joints)]:
+                raise ShardError(f"hand '{record.name}': its URDF has no link or joint {name!r}")
+            return cls(urdf, record.base_link, record.joint_names)
 
     def poses(self, q: np.ndarray) -> dict[str, np.ndarray]:
         """``T_base_link`` of the links that have a surface, each shape [n, 4, 4]; q [rad or m] is [n, K]."""

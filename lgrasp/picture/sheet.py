@@ -1,14 +1,18 @@
-"""Pictures side by side, with captions, as one image file."""
+"""Image files: pictures side by side, with captions, and plots."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lgrasp.errors import OutputError
-from lgrasp.files import check_file
+from lgrasp.files import check_file, write_file
+
+if TYPE_CHECKING:  # slow to import
+    from matplotlib.figure import Figure
 
 FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP", ".gif": "GIF"}
 """Of image files, by suffix."""
@@ -49,14 +53,14 @@ def sheet(
     return out
 
 
-def check_image(path: Path) -> None:
+def check_image(path: Path, suffixes: Collection[str] = FORMATS.keys()) -> None:
     """Check, before a long job, that an image can be written there.
 
     Raises:
-        OutputError: another suffix than those of :data:`FORMATS`, a folder, or a place that cannot be written.
+        OutputError: another suffix, a folder, or a place that cannot be written.
     """
-    if path.suffix.lower() not in FORMATS or path.is_dir():
-        raise OutputError(f"picture {path} cannot be written: name a file that ends in {', '.join(FORMATS)}")
+    if path.suffix.lower() not in suffixes or path.is_dir():
+        raise OutputError(f"picture {path} cannot be written: name a file that ends in {', '.join(suffixes)}")
     check_file(path)
 
 
@@ -72,3 +76,14 @@ def gif_bytes(images: Sequence[Image.Image], seconds: Sequence[float]) -> bytes:
     out, (first, *others) = io.BytesIO(), images
     first.save(out, "GIF", append_images=others, save_all=True, duration=[1000 * s for s in seconds], loop=0)
     return out.getvalue()
+
+
+def write_plot(figure: "Figure", path: Path) -> None:
+    """Write a figure as a PNG file, without a display.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    write_file(path, data.getvalue())

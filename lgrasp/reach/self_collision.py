@@ -4,17 +4,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from lgrasp.files import temporary_folder
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.poses import device_from_matrix
-from lgrasp.grasp.hand_files import write_hand
+from lgrasp.grasp.hand_files import checked_urdf
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.arrays import upload_pieces
 from lgrasp.hand.geometry import link_pieces
 from lgrasp.hand.links import link_poses
 from lgrasp.hand.pairs import ALMOST_ALWAYS, PAIR_POSTURES, placed_pieces_touch, separate_pairs
 from lgrasp.hand.piece import Piece
-from lgrasp.hand.urdf import read_urdf
 from lgrasp.reach.arm import Arm
 
 
@@ -25,8 +23,7 @@ def base_pieces(record: HandRecord, decompose: Decompose | None = None) -> list[
         ShardError: a mesh is missing.
         HandError: the URDF or a mesh cannot be used.
     """
-    with temporary_folder() as folder:
-        urdf = read_urdf(write_hand(record, folder))
+    with checked_urdf(record) as urdf:
         still = {record.base_link}
         for _ in urdf.joints:  # each adds a neighbour at least, or there is none
             ends = [{joint.parent, joint.child} for joint in urdf.joints if not joint.movable]

@@ -9,11 +9,10 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.files import check_heaps
-from lgrasp.dataset.new_shard import new_shard_file
 from lgrasp.dataset.reader import FileReader, reading
 from lgrasp.dataset.structure import expand, schema_problems, whole_problems
 from lgrasp.dataset.validate import file_problems
-from lgrasp.dataset.writer import create_array, finish, write_models
+from lgrasp.dataset.writer import create_array, finish, new_shard_file, write_models
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import DatasetSpec
 from lgrasp.picture.camera import Intrinsics

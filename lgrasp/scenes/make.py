@@ -10,14 +10,14 @@ from lgrasp.geometry.poses import compose, device_from_stored, inverse, pose_mat
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.arrays import HandArrays, body_poses
 from lgrasp.object.arrays import Object, ObjectArrays
+from lgrasp.picture.camera import central_camera
 from lgrasp.picture.depth import LabelledMesh, join_surfaces, render
 from lgrasp.runtime.fetch import to_numpy
 from lgrasp.scenes import collision_kernels as kernels
-from lgrasp.scenes.camera import intrinsics_of, place_cameras
 from lgrasp.scenes.drop import drop
 from lgrasp.scenes.params import CameraParams, SceneParams
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
-from lgrasp.scenes.render import add_noise, draw_offsets, merge_views, table_surface
+from lgrasp.scenes.render import add_noise, draw_offsets, merge_views, place_cameras, table_surface
 from lgrasp.scenes.schema import DEPTH_UNIT
 from lgrasp.seeding import stage_seed
 from lgrasp.simulate.solid import Solid
@@ -145,7 +145,8 @@ def _observe(
     surface: LabelledMesh, params: CameraParams, rng: np.random.Generator, device: str
 ) -> tuple[ViewsRecord, CloudRecord]:
     """Images of a surface by cameras around the table, and the cloud made from them."""
-    camera, pose = intrinsics_of(params), place_cameras(params, rng).astype(np.float32)
+    camera = central_camera(params.width, params.height, params.angle)
+    pose = place_cameras(params, rng).astype(np.float32)
     offsets = draw_offsets(params, rng).astype(np.float32)
     images = add_noise(render(surface, camera, pose, device), params, rng)
     views = ViewsRecord(

@@ -2,12 +2,13 @@
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field
 
 from lgrasp.config import Params
-from lgrasp.simulate.protocol import FRICTION
+from lgrasp.simulate.protocol import FRICTION, in_order
 
 _Length = Annotated[float, Field(gt=0.0, le=5.0)]
+_Elevation = Annotated[float, Field(ge=5.0, le=89.0)]
 
 
 class CameraParams(Params):
@@ -19,8 +20,12 @@ class CameraParams(Params):
     width: int = Field(default=320, ge=16, le=4096, description="Pixels.")
     height: int = Field(default=240, ge=16, le=4096, description="Pixels.")
     angle: float = Field(default=55.0, gt=5.0, le=150.0, description="Field of view across the width.")
-    distance: tuple[_Length, _Length] = Field(default=(0.7, 0.9), description="Range from the middle of the table.")
-    elevation: tuple[float, float] = Field(default=(35.0, 60.0), description="Range above the horizon.")
+    distance: Annotated[tuple[_Length, _Length], AfterValidator(in_order)] = Field(
+        default=(0.7, 0.9), description="Range from the middle of the table."
+    )
+    elevation: Annotated[tuple[_Elevation, _Elevation], AfterValidator(in_order)] = Field(
+        default=(35.0, 60.0), description="Range above the horizon."
+    )
     noise: float = Field(default=0.001, ge=0.0, le=0.1, description="Standard deviation of a depth, near the camera.")
     noise_square: float = Field(
         default=0.0015, ge=0.0, le=0.1, description="Additional standard deviation per depth squared [1/m]."
@@ -32,15 +37,6 @@ class CameraParams(Params):
     voxel: float = Field(
         default=0.003, ge=0.0, le=0.1, description="Edge of the cubes of which one point is kept; 0: all."
     )
-
-    @model_validator(mode="after")
-    def _ranges(self) -> "CameraParams":
-        for name, (low, high) in (("distance", self.distance), ("elevation", self.elevation)):
-            if not low <= high:
-                raise ValueError(f"{name} [{low:g}, {high:g}] is empty")
-        if not (self.elevation[0] >= 5.0 and self.elevation[1] <= 89.0):
-            raise ValueError(f"elevation {list(self.elevation)} must lie within 5 to 89 degrees")
-        return self
 
 
 class DropParams(Params):

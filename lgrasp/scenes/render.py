@@ -1,4 +1,4 @@
-"""What depth cameras make of exact images: noise, normals, one merged cloud."""
+"""Where depth cameras stand around a table, and what they make of exact images: noise, normals, one merged cloud."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import warp as wp
 
 from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.picture.camera import look_at
 from lgrasp.picture.depth import Images, LabelledMesh
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.fetch import to_numpy
@@ -27,6 +28,16 @@ def table_surface(side: float) -> LabelledMesh:
     x = 0.5 * side
     corners = np.array([[-x, -x, 0.0], [x, -x, 0.0], [x, x, 0.0], [-x, x, 0.0]])
     return LabelledMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, TABLE))
+
+
+def place_cameras(params: CameraParams, rng: np.random.Generator) -> np.ndarray:
+    """Poses T_scene_camera, shape (v, 7), of cameras evenly around the origin, from a random direction on."""
+    azimuth = 2.0 * np.pi * (rng.random() + np.arange(params.views) / params.views)
+    elevation = np.radians(rng.uniform(*params.elevation, params.views))
+    distance = rng.uniform(*params.distance, params.views)
+    level = np.cos(elevation)
+    direction = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    return look_at(distance[:, None] * direction, np.zeros(3))
 
 
 def image_normals(images: Images, window: int, device: str) -> np.ndarray:

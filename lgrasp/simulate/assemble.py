@@ -13,7 +13,7 @@ from lgrasp.errors import PhysicsError
 from lgrasp.hand.drafting.elements import set_origin
 from lgrasp.hand.pairs import ALMOST_ALWAYS
 from lgrasp.hand.piece import Piece
-from lgrasp.hand.urdf import joint_end, numbers, parse_robot
+from lgrasp.hand.urdf import numbers, parse_robot
 from lgrasp.simulate.builder import (
     add_drive,
     add_hull,
@@ -27,26 +27,6 @@ from lgrasp.simulate.builder import (
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import HandSolids
 from lgrasp.simulate.solid import Solid
-
-
-def joint_ends(text: str) -> dict[str, tuple[str, str]]:
-    """Parent and child link of every joint of a URDF text.
-
-    Raises:
-        HandError: not XML, or no <robot>.
-    """
-    tree, _ = parse_robot(Path("hand.urdf"), text.encode())
-    return {j.get("name", ""): (joint_end(j, "parent"), joint_end(j, "child")) for j in tree.iterfind("joint")}
-
-
-def welded_joints(text: str, base_link: str) -> list[str]:
-    """Joints of a URDF text between its root and the base link, which hold still."""
-    above = {child: (name, parent) for name, (parent, child) in joint_ends(text).items()}
-    found, link = [], base_link
-    while link in above:
-        name, link = above[link]
-        found.append(name)
-    return found
 
 
 def bare_urdf(text: str, held: Mapping[str, float]) -> str:
@@ -107,9 +87,14 @@ def assemble(
         ValueError: MuJoCo refuses the hand.
     """
     loads = [protocol.load(solid.volume) for solid in objects]
-    spec = mujoco.MjSpec.from_string(bare_urdf(hand.urdf, held))
+    spec = mujoco.MjSpec.from_string(bare_urdf(hand.record.urdf, held))
     set_options(mujoco, spec, protocol)
-    _add_pieces(mujoco, spec, hand)
+    for link, pieces in hand.pieces.items():
+        body = spec.body(link)
+        if body is None and pieces:
+            raise PhysicsError(f"MuJoCo does not know link '{link}' of hand '{hand.record.name}'")
+        for number, piece in enumerate(pieces):
+            _add_piece(mujoco, spec, body, piece, f"{link} {number}")
     for equality in spec.equalities:
         equality.solref, equality.solimp[:2] = [2.0 * protocol.timestep, 1.0], _COUPLING
     followers = {equality.name1 for equality in spec.equalities}
@@ -129,15 +114,6 @@ def assemble(
     for a, b in _always_touching(mujoco, model):
         spec.add_exclude(bodyname1=model.body(a).name, bodyname2=model.body(b).name)
     return spec
-
-
-def _add_pieces(mujoco: Any, spec: Any, hand: HandSolids) -> None:
-    for link, pieces in hand.pieces.items():
-        body = spec.body(link)
-        if body is None and pieces:
-            raise PhysicsError(f"MuJoCo does not know link '{link}' of hand '{hand.name}'")
-        for number, piece in enumerate(pieces):
-            _add_piece(mujoco, spec, body, piece, f"{link} {number}")
 
 
 def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> None:
@@ -164,9 +140,9 @@ def _inflated(piece: Piece) -> np.ndarray:
 
 def _exclude_neighbours(spec: Any, hand: HandSolids) -> None:
     """Links joined by a joint do not collide; MuJoCo forgets those joined to what is welded to the world."""
-    for parent, child in joint_ends(hand.urdf).values():
-        if spec.body(parent) is not None and spec.body(child) is not None:
-            spec.add_exclude(bodyname1=parent, bodyname2=child)
+    for joint in hand.joints:
+        if spec.body(joint.parent) is not None and spec.body(joint.child) is not None:
+            spec.add_exclude(bodyname1=joint.parent, bodyname2=joint.child)
 
 
 def _always_touching(mujoco: Any, model: Any) -> list[tuple[int, int]]:

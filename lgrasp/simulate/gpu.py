@@ -58,33 +58,20 @@ class WorldTrials:
     Args:
         device: Warp device.
         worlds: hands closed at a time.
-        all_directions, settled_stop: as of :class:`Trial`.
+        all_directions: as of :class:`Trial`.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        device: str,
-        *,
-        worlds: int = 4096,
-        all_directions: bool = False,
-        settled_stop: bool = True,
-    ) -> None:
+    def __init__(self, model: Model, device: str, *, worlds: int = 4096, all_directions: bool = False) -> None:
         self._model, self._protocol = model, model.protocol
         placed = Placed.of(model, device)
         self._sim = Worlds(model, placed, worlds, device)
         self._pulled = [Worlds(model, placed, max(1, int(worlds * share)), device) for share in _SHARES]
-        self._every, self._settled_stop = all_directions, settled_stop
-        self._spare = Trial(model, all_directions=all_directions, settled_stop=settled_stop)
+        self._every = all_directions
+        self._spare = Trial(model, all_directions=all_directions)
         self._bounds, self._one = Bounds(model.protocol), threading.Lock()
         at, turn = (a[0, model.base_body].astype(float) for a in self._sim.frames())
         T = np.block([[turn, at[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
         self._base, self._base_rotation = pose_from_matrix(T[None])[0], turn
-
-    @property
-    def steps(self) -> int:
-        """World-steps simulated so far."""
-        return self._sim.steps + sum(sim.steps for sim in self._pulled)
 
     def run(self, rows: GraspRows, progress: Callable[[int, int], None] | None = None) -> list[Verdict]:
         """The verdicts of all rows."""
@@ -238,9 +225,7 @@ class WorldTrials:
             worst, depth = np.maximum(worst, here), np.where(wild, depth, np.maximum(depth, now.depth))
             done += 1
             held = ~wild & bounds.held(worst, touches, depth)
-            over = wild | bounds.lost(worst) | (done >= total)
-            if self._settled_stop:
-                over |= held & bounds.near(before, here, total - done)
+            over = wild | bounds.lost(worst) | (done >= total) | (held & bounds.near(before, here, total - done))
             before = here
             hands.full[job[busy[now.full[busy]], 0]] = True
             ended = busy[over[busy]]

@@ -1,8 +1,9 @@
-"""Protocols that lift: the hand comes to an object on a table or is at a free one, closes, takes it up and holds it.
+"""Protocols that move the hand: it comes to an object on a table or is at a free one, closes, takes it up and holds it;
+or it is shaken and turned with objects in it.
 
 All is told from the hand, whose base stands still as in every protocol: the table moves by the opposite of the hand's
-way, and the object feels its weight and the inertia of the hand's acceleration. Nothing pulls at the hand's own links:
-the controller carries them.
+way, and objects feel their weight and the inertia of the hand's acceleration; turns are slow, their inertia is left
+out. Nothing pulls at the hand's own links: the controller carries them.
 """
 
 from collections.abc import Sequence
@@ -15,14 +16,16 @@ from scipy.spatial.transform import Rotation
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.model import Model
-from lgrasp.simulate.protocol import FreeLift, Lift, Protocol
+from lgrasp.simulate.protocol import GRAVITY, FreeLift, Lift, Protocol, Shake
 from lgrasp.simulate.scene import Scene
-from lgrasp.simulate.solid import Solid
-from lgrasp.simulate.verdict import Bounds, Look, Verdict, at_rest, chunk_of, moved
+from lgrasp.simulate.verdict import AXES, Bounds, Look, Verdict, at_rest, chunk_of, moved
 
 if TYPE_CHECKING:
     from lgrasp.simulate.mujoco_world import MujocoWorld
     from lgrasp.simulate.physx_world import PhysxWorld
+
+_ORDER = (0, 2, 4, 1, 3, 5)  # of AXES: each at a right angle to the one before
+_WAVES = 4  # of each axis
 
 
 class LiftCourse(NamedTuple):
@@ -48,30 +51,23 @@ class Lifted(NamedTuple):
     settled: bool = False
     on_table: bool = False
     diverged: bool = False
-    steps: int = 0
 
 
 def check_liftable(protocol: Protocol, scene: Scene, rows: GraspRows) -> None:
     """Raises PhysicsError unless each row has one object and, to lift it off a table, names a plane that this rests
     on, and a way to it."""
-    index = np.asarray(rows.object_index)
-    if protocol.table is None:
-        if index.shape[1] != 1:
-            raise PhysicsError(f"protocol {protocol.name} cannot simulate these grasps: they have several objects")
-        return
-    if not {"pose", "approach"} <= set(rows.table) or any(solid.tables is None for solid in scene.objects):
-        said = "they do not say how the object lies on a table"
-    elif index.shape[1] != 1:
+    index, said, hint = np.asarray(rows.object_index), "", ""
+    if protocol.table:
+        planes = [solid.tables for solid in scene.objects if solid.tables is not None]
+        hint = "; lgrasp generate --table makes such"
+        if not {"pose", "approach"} <= set(rows.table) or len(planes) < len(scene.objects):
+            said = "they do not say how the object lies on a table"
+        elif any((rows.table["pose"][index[:, 0] == k] >= len(known)).any() for k, known in enumerate(planes)):
+            said = "table/pose names a plane that the object does not have"
+    if index.shape[1] != 1:
         said = "they have several objects"
-    elif not all(_known(rows.table["pose"][index[:, 0] == k], solid) for k, solid in enumerate(scene.objects)):
-        said = "table/pose names a plane that the object does not have"
-    else:
-        return
-    raise PhysicsError(f"protocol lift cannot simulate these grasps: {said}; lgrasp generate --table makes such")
-
-
-def _known(pose: np.ndarray, solid: Solid) -> bool:
-    return bool((pose < len(solid.tables if solid.tables is not None else ())).all())
+    if said:
+        raise PhysicsError(f"protocol {protocol.name} cannot simulate these grasps: {said}{hint}")
 
 
 def course_of(
@@ -99,7 +95,7 @@ def course_of(
     come, push = np.zeros((1, 3)), np.zeros((steps(protocol.hold), 3))
     if isinstance(lift, Lift):
         assert approach is not None
-        come, push = -lift.way * (1.0 - smooth(steps(lift.coming)))[:, None] * approach, _shaking(lift, push, dt, up)
+        come, push = -lift.way * (1.0 - smooth(steps(lift.coming)))[:, None] * approach, _swaying(lift, push, dt, up)
     closes = len(come) - 1
     closed = np.zeros(((len(stops) - 1) * closing + rest, 3))
     rise = lift.height * smooth(rising)[:, None] * up
@@ -130,7 +126,7 @@ def smooth(steps: int) -> np.ndarray:
     return t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
 
 
-def _shaking(lift: Lift, still: np.ndarray, dt: float, up: np.ndarray) -> np.ndarray:
+def _swaying(lift: Lift, still: np.ndarray, dt: float, up: np.ndarray) -> np.ndarray:
     """Acceleration of the hand in each step of the hold, base frame [m/s^2], shaped as ``still`` (n, 3)."""
     count = len(still)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
@@ -195,12 +191,12 @@ def _carry(world: "MujocoWorld | PhysxWorld", model: Model, course: LiftCourse, 
         world.step(1)
         if (step + 1) % chunk == 0 or step + 1 == total:
             if world.wild():
-                return Lifted(pushed, settled=settled, diverged=True, steps=step + 1)
+                return Lifted(pushed, settled=settled, diverged=True)
             if step >= counts:
                 far = np.maximum(far, moved(world.objects(), home, model.centers))
                 if bounds.lost(far):
-                    return Lifted(pushed, far.max(0), settled, world.on_table(), steps=step + 1)
-    return Lifted(pushed, far.max(0), settled, world.on_table(), steps=total)
+                    break
+    return Lifted(pushed, far.max(0), settled, world.on_table())
 
 
 def _table_at(model: Model, pose: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -224,23 +220,43 @@ def _placed(at: np.ndarray, turn: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 def conclude_lift(bounds: Bounds, look: Look, found: Lifted) -> Verdict:
     """The verdict of one grasp."""
-    stays = bool(bounds.stays(found.moved[None]))
     return Verdict(
-        holds=stays and not found.on_table,
-        directions=np.full(6, -1, np.int8),
+        holds=bool(bounds.stays(found.moved[None])) and not found.on_table,
         displacement=found.moved[0],
         rotation=found.moved[1],
-        slip=np.nan,
         contact_at_q=int(look.contact_at_q.min()),
-        contact_at_grasp=-1,
         pregrasp_penetration=look.depth,
         settled=found.settled,
         diverged=found.diverged,
-        stays=stays,
-        penetration=look.object_depth,
-        object_touches=np.full(1, -1, np.int8),
-        object_displacement=found.moved[:1],
-        object_rotation=found.moved[1:],
         pushed=found.pushed,
         on_table=found.on_table,
     )
+
+
+def shake_course(protocol: Protocol) -> dict[int, np.ndarray]:
+    """What pulls at the objects in each step, over their weight, base frame.
+
+    Returns:
+        For each direction of gravity, by its place in AXES and in the order in which the hand goes through them, the
+        way to it and the hold there, (T, 3). On the way to the first the hand is shaken.
+    """
+    shake, dt = protocol.shake, protocol.timestep
+    assert shake
+    hold = np.ones((max(1, round(protocol.hold / dt)), 1))
+    angle = 0.5 * np.pi * smooth(max(1, round(shake.turning / dt)))[1:, None]
+    course: dict[int, np.ndarray] = {}
+    for before, k in zip((None, *_ORDER), _ORDER, strict=False):
+        if before is None:
+            way = AXES[k] - _shaking(shake, dt) / GRAVITY
+        else:
+            way = np.cos(angle) * AXES[before] + np.sin(angle) * AXES[k]
+        course[k] = np.concatenate([way, hold * AXES[k]])
+    return course
+
+
+def _shaking(shake: Shake, dt: float) -> np.ndarray:
+    """Acceleration of the hand in each step (n, 3) [m/s^2]: along each axis a sum of sines."""
+    rng, time = np.random.default_rng(shake.seed), dt * np.arange(1, 1 + max(1, round(shake.shaking / dt)))
+    frequency, phase = rng.uniform(*shake.frequency, (_WAVES, 3)), rng.uniform(0.0, 2 * np.pi, (_WAVES, 3))
+    push = np.sin(2 * np.pi * frequency * time[:, None, None] + phase).sum(1)
+    return shake.acceleration * push / np.linalg.norm(push, axis=1).max()

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError, short_reason
+from lgrasp.hand.links import joints_above
 from lgrasp.runtime.optional import import_mujoco
-from lgrasp.simulate.assemble import OBJECT, TABLE, assemble, welded_joints
+from lgrasp.simulate.assemble import OBJECT, TABLE, assemble
 from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import Scene
 
@@ -86,18 +87,19 @@ def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequen
         PhysicsError: MuJoCo is missing or refuses the hand; its reason is in the message.
     """
     import_mujoco()
-    joints = scene.hand.joint_names
-    carried = [name for name in welded_joints(scene.hand.urdf, scene.hand.base_link) if name in joints]
-    held = tuple((name, float(q[joints.index(name)])) for name in carried)
+    hand = scene.hand.record
+    column = {name: k for k, name in enumerate(hand.joint_names)}
+    above = [joint.name for joint in joints_above(scene.hand.joints, hand.base_link)]
+    held = tuple((name, float(q[column[name]])) for name in above if name in column)
     return _build(scene, protocol.model_dump_json(), held, tuple(objects))
 
 
 @lru_cache(maxsize=8)
 def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects: tuple[int, ...]) -> Model:
-    mujoco, hand, protocol = import_mujoco(), scene.hand, Protocol.model_validate_json(text)
+    mujoco, hand, protocol = import_mujoco(), scene.hand.record, Protocol.model_validate_json(text)
     solids = [scene.objects[index] for index in objects]
     try:
-        spec = assemble(mujoco, hand, solids, protocol, dict(held))
+        spec = assemble(mujoco, scene.hand, solids, protocol, dict(held))
         model = spec.compile()
         for geom in spec.geoms:
             if geom.parent.name.startswith(OBJECT):

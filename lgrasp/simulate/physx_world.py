@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
-from lgrasp.runtime.optional import import_mujoco
+from lgrasp.runtime.optional import import_mujoco, import_optional
 from lgrasp.simulate.model import Model, leaders
 from lgrasp.simulate.verdict import WILD, links_touching
 
@@ -38,16 +38,9 @@ def import_physx() -> Any:
     Raises:
         PhysicsError: it is not installed.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of graphics that are not used
-            import sapien
-            import sapien.physx
-    except ImportError:
-        raise PhysicsError(
-            '--engine physx needs the package sapien, which is not installed: pip install "lgrasp[physx]"'
-        ) from None
-    return sapien
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of graphics that are not used
+        return import_optional("--engine physx needs the package sapien", '"lgrasp[physx]"', "sapien", "physx")
 
 
 class _Coupled(NamedTuple):
@@ -202,33 +195,31 @@ class PhysxWorld:
 
     def links_touching(self) -> np.ndarray:
         """Number of the hand's bodies in contact with each object (O,)."""
-        bodies = [pair for pair, points in self._contacts() if min(p.separation for p in points) < 0.0]
-        bodies = np.array(bodies, int).reshape(-1, 2)
-        return links_touching(bodies, self._model.object_body, self._m.nbody)
+        return links_touching(self._touching(), self._model.object_body, self._m.nbody)
 
     def on_table(self) -> bool:
         """Whether an object touches the table."""
-        pairs = {frozenset(pair) for pair, points in self._contacts() if min(p.separation for p in points) < 0.0}
-        return any({self._model.table.body, int(body)} in pairs for body in self._model.object_body)
+        bodies, objects = self._touching(), self._model.object_body
+        return bool(((bodies == self._model.table.body).any(1) & np.isin(bodies, objects).any(1)).any())
 
     def deepest(self) -> float:
         """Deepest penetration of any object, in a link or in another object [m]."""
         own = set(self._model.object_body.tolist())
-        found = [p.separation for pair, points in self._contacts() if own & {*pair} for p in points]
-        return max(0.0, -min(found, default=0.0))
+        return max([0.0, *(-apart for pair, apart in self._contacts() if own & {*pair})])
 
     def wild(self) -> bool:
         """True if the simulation has diverged."""
         speed = np.concatenate([self.velocities().ravel(), self._hand.get_qvel()])
         return not np.abs(speed).max() < WILD
 
-    def _contacts(self) -> list[tuple[tuple[int, int], Any]]:
-        found = []
-        for contact in self._system.get_contacts():
-            if contact.points:
-                a, b = contact.bodies
-                found.append(((self._number[a], self._number[b]), contact.points))
-        return found
+    def _contacts(self) -> list[tuple[list[int], float]]:
+        """Both bodies of each contact, and how far they are apart [m]."""
+        contacts = [contact for contact in self._system.get_contacts() if contact.points]
+        return [([self._number[body] for body in c.bodies], min(p.separation for p in c.points)) for c in contacts]
+
+    def _touching(self) -> np.ndarray:
+        """Both bodies of each contact that presses, (n, 2)."""
+        return np.array([pair for pair, apart in self._contacts() if apart < 0.0], int).reshape(-1, 2)
 
     def _make(self) -> None:
         """A scene without a past: what PhysX remembers of contacts would let one grasp decide the next."""

@@ -49,7 +49,12 @@ class Physics(Params):
     noslip: int = Field(default=2, ge=0, description="Iterations of the solver that takes the creep out of friction.")
 
 
-def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
+def in_order(ends: tuple[float, float]) -> tuple[float, float]:
+    """A range, smallest number first.
+
+    Raises:
+        ValueError: it is not.
+    """
     if ends[0] > ends[1]:
         raise ValueError("the smaller number of a range comes first")
     return ends
@@ -57,9 +62,9 @@ def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
 
 _NotNegative = Annotated[float, Field(ge=0)]
 _Positive = Annotated[float, Field(gt=0)]
-Range = Annotated[tuple[_NotNegative, _NotNegative], AfterValidator(_in_order)]
+Range = Annotated[tuple[_NotNegative, _NotNegative], AfterValidator(in_order)]
 """Smallest and largest value."""
-PositiveRange = Annotated[tuple[_Positive, _Positive], AfterValidator(_in_order)]
+PositiveRange = Annotated[tuple[_Positive, _Positive], AfterValidator(in_order)]
 """Likewise, both above 0."""
 
 
@@ -253,26 +258,25 @@ class Protocol(Physics):
         return json.dumps(self.model_dump(mode="json") | resolved, sort_keys=True)
 
 
-def _protocols() -> dict[str, Protocol]:
-    gravity: dict[str, Any] = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
-    sequence: dict[str, Any] = {"start": "grasp", "success": "touches", "rest": 0.6, "most_rotation": 180.0}
-    sequence |= {"timestep": 1 / 240, **gravity}  # of 1/60 s each step is cut in four
-    pulls = 100 / 60  # 100 steps
-    made = (
+_GRAVITY: dict[str, Any] = {"kind": "weight", "most_displacement": 0.02, "stiffness_range": (5.0, 100.0)}
+_SEQUENCE: dict[str, Any] = {"start": "grasp", "success": "touches", "rest": 0.6, "most_rotation": 180.0, **_GRAVITY}
+_SEQUENCE |= {"timestep": 1 / 240}  # of 1/60 s each step is cut in four
+_PULLS = 100 / 60  # 100 steps
+
+PROTOCOLS: dict[str, Protocol] = {
+    protocol.name: protocol
+    for protocol in (
         Protocol(name="fc"),
-        Protocol(name="gravity6", friction=FRICTION, **gravity),
-        Protocol(name="gravity6_mu1", friction=1.0, **gravity),
-        Protocol(name="seq6", friction=2.0, hold=pulls, **sequence),
-        Protocol(name="seq6_mu06", friction=FRICTION, hold=pulls, **sequence),
-        Protocol(name="seq_shake", friction=2.0, shake=Shake(), hold=0.5, **sequence),
+        Protocol(name="gravity6", friction=FRICTION, **_GRAVITY),
+        Protocol(name="gravity6_mu1", friction=1.0, **_GRAVITY),
+        Protocol(name="seq6", friction=2.0, hold=_PULLS, **_SEQUENCE),
+        Protocol(name="seq6_mu06", friction=FRICTION, hold=_PULLS, **_SEQUENCE),
+        Protocol(name="seq_shake", friction=2.0, shake=Shake(), hold=0.5, **_SEQUENCE),
         Protocol(name="fc_random", draws=Draws()),
         Protocol(name="lift", lift=Lift(), force=0.981, rest=0.2),
         Protocol(name="dipgrasp", lift=FreeLift(height=0.2), force=0.981, rest=0.2, hold=3.0, most_rotation=180.0),
     )
-    return {protocol.name: protocol for protocol in made}
-
-
-PROTOCOLS: dict[str, Protocol] = _protocols()
+}
 """The named protocols: ``fc`` is DexGraspBench's, ``gravity6`` and ``gravity6_mu1`` ask for more; ``seq6`` is the one
 that sequences of objects were published with, ``seq6_mu06`` the same on smoother objects, ``seq_shake`` after the test
 on their robot; ``fc_random`` is ``fc`` with random numbers, several times; ``lift`` takes the 0.1 kg of ``fc`` off a

@@ -90,7 +90,6 @@ def verdicts(
     progress: Callable[[int, int], None] | None = None,
     *,
     all_directions: bool = False,
-    settled_stop: bool = True,
     device: str = "cpu",
     keep: Keep | None = None,
     prepared: Callable[[float], None] | None = None,
@@ -110,7 +109,6 @@ def verdicts(
         threads: grasps simulated at a time; those of PhysX, which lets a process simulate one at a time, in processes.
         progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
         all_directions: continue after the first direction in which an object is lost.
-        settled_stop: end a direction when the objects have come to rest well inside their bounds.
         device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0); PhysX runs on the CPU.
         keep: called with (kind, key, make), gives what it made for the key before, or makes it: what a GPU is given,
             and processes, then serve further calls.
@@ -125,7 +123,6 @@ def verdicts(
         check_liftable(protocol, scene, rows)
     slots = np.full(np.shape(rows.object_index), -1)
     found: dict[int, Verdict] = {}
-    options = {"all_directions": all_directions, "settled_stop": settled_stop}
     before = [0, 0]  # rows done and held
 
     def advanced(done: int, held: int) -> None:
@@ -136,15 +133,15 @@ def verdicts(
         begin = time.perf_counter()
         model = build_model(scene, protocol, rows.q[0], group.objects)
         _check_held(model, group.rows)
-        worlds = None if on_cpu(device, protocol) else _worlds(model, device, len(group.rows), options, keep)
+        worlds = None if on_cpu(device, protocol) else _worlds(model, device, len(group.rows), all_directions, keep)
         if prepared:
             prepared(time.perf_counter() - begin)
         if worlds:
             some = worlds.run(group.rows, advanced)
         elif protocol.engine == "physx" and threads > 1 and len(group.rows) > _FEW:
-            some = _in_processes(model, group.rows, threads, advanced, options, keep)
+            some = _in_processes(model, group.rows, threads, advanced, all_directions, keep)
         else:
-            some = _on_threads(model, group.rows, threads, advanced, options)
+            some = _on_threads(model, group.rows, threads, advanced, all_directions)
         slots[group.index] = group.slots
         found |= zip(group.index.tolist(), some, strict=True)
         before = [before[0] + len(some), before[1] + sum(verdict.holds for verdict in some)]
@@ -173,7 +170,7 @@ def _check_device(device: str, protocol: Protocol) -> None:
         raise PhysicsError(f"protocol {protocol.name} {why}")
 
 
-def _worlds(model: Model, device: str, rows: int, options: dict[str, bool], keep: Keep | None) -> "WorldTrials":
+def _worlds(model: Model, device: str, rows: int, all_directions: bool, keep: Keep | None) -> "WorldTrials":
     """Worlds for the rows, or those made before; their kernels are compiled."""
     import warp as wp
 
@@ -181,20 +178,20 @@ def _worlds(model: Model, device: str, rows: int, options: dict[str, bool], keep
 
     def make() -> WorldTrials:
         worlds = hands_at_once(rows, len(model.object_body), wp.get_device(device).free_memory)
-        return WorldTrials(model, device, worlds=worlds, **options)
+        return WorldTrials(model, device, worlds=worlds, all_directions=all_directions)
 
-    return keep("simulate", (model, device, *options.items()), make) if keep else make()
+    return keep("simulate", (model, device, all_directions), make) if keep else make()
 
 
 def _on_threads(
-    model: Model, rows: GraspRows, threads: int, progress: Callable[[int, int], None], options: dict[str, bool]
+    model: Model, rows: GraspRows, threads: int, progress: Callable[[int, int], None], all_directions: bool
 ) -> list[Verdict]:
     """A verdict of every row, each on a thread of the CPU."""
     own = threading.local()
 
     def judge(i: int) -> Verdict:
         if not hasattr(own, "trial"):
-            own.trial = Trial(model, **options)
+            own.trial = Trial(model, all_directions=all_directions)
         return own.trial.run(rows, i)
 
     with _silence(), ThreadPoolExecutor(threads) as pool:
@@ -206,11 +203,11 @@ def _in_processes(
     rows: GraspRows,
     workers: int,
     progress: Callable[[int, int], None],
-    options: dict[str, bool],
+    all_directions: bool,
     keep: Keep | None,
 ) -> list[Verdict]:
     """The same, each in a process."""
-    packed = pickle.dumps((model, rows, options))
+    packed = pickle.dumps((model, rows, all_directions))
     make = partial(ProcessPool, workers)
     pool: Executor = keep("processes", workers, make) if keep else make()
     try:
@@ -230,8 +227,8 @@ def _judge(packed: bytes, i: int) -> Verdict:
 
 @lru_cache(maxsize=1)
 def _unpacked(packed: bytes) -> tuple[Trial, GraspRows]:
-    model, rows, options = pickle.loads(packed)
-    return Trial(model, **options), rows
+    model, rows, all_directions = pickle.loads(packed)
+    return Trial(model, all_directions=all_directions), rows
 
 
 def _collected(found: Sequence[Future[Verdict]], progress: Callable[[int, int], None]) -> list[Verdict]:

@@ -1,14 +1,17 @@
 """A triangle mesh as a rigid body: convex pieces that collide, and the inertia of the mesh itself."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
-from lgrasp.errors import DecomposeError, ObjectError
+from lgrasp.errors import DecomposeError, ObjectError, PhysicsError
 from lgrasp.geometry.decompose import Decompose
+from lgrasp.geometry.decompose import decompose as cut_mesh
 from lgrasp.geometry.hulls import fewer_corners
+from lgrasp.grasp.records import ObjectRecord
 from lgrasp.hand.distance import signed_distance
 from lgrasp.object.mass import mass_properties
 
@@ -42,20 +45,27 @@ class Solid:
     """What a user should know: the hull stands for the mesh, the mesh is not closed."""
 
 
-def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device: str) -> Solid:
-    """A mesh as a rigid body. Where cutting it fails its hull collides, and a note says so.
+def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> Solid:
+    """The object of a shard as a rigid body, in the frame of its vertices. Where cutting its mesh fails the hull
+    collides, and a note says so.
 
     Args:
         decompose: cuts the mesh, perhaps with a cache.
         device: answers the geometric queries.
 
     Raises:
+        PhysicsError: a point cloud.
         ObjectError: a flat mesh.
     """
+    if not len(record.faces):
+        raise PhysicsError(f"object '{record.name}' is a point cloud; a simulator needs a mesh, as of a complete scan")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mesh = trimesh.Trimesh(np.asarray(record.vertices, float), np.asarray(record.faces), process=True)
     try:
         hull = ConvexHull(mesh.vertices)
     except QhullError:
-        raise ObjectError(f"object '{name}' is flat; a rigid body needs volume") from None
+        raise ObjectError(f"object '{record.name}' is flat; a rigid body needs volume") from None
     notes = []
     body = mass_properties(mesh.vertices, mesh.faces)
     if not body.solid:
@@ -74,12 +84,13 @@ def solid_of_mesh(name: str, mesh: trimesh.Trimesh, decompose: Decompose, device
         else:
             notes.append(f"the convex hull stands for the mesh, its dents are filled ({failures[-1]})")
     return Solid(
-        name=name,
+        name=record.name,
         pieces=tuple(np.ascontiguousarray(_thinned(piece), float) for piece in pieces),
         volume=body.volume,
         center=body.center,
         inertia=body.inertia,
         excess=excess,
+        tables=record.tables,
         notes=tuple(notes),
     )
 

@@ -6,10 +6,9 @@ import numpy as np
 
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.draws import draw_of, tune
-from lgrasp.simulate.lift import Lifted, conclude_lift, lift_row
+from lgrasp.simulate.lift import Lifted, conclude_lift, lift_row, shake_course
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.mujoco_world import MujocoWorld
-from lgrasp.simulate.shake import shake_course
 from lgrasp.simulate.slip import Frames, points_on_links, slips
 from lgrasp.simulate.verdict import (
     AXES,
@@ -32,10 +31,9 @@ class Trial:
     Args:
         model: O objects in the order of the rows.
         all_directions: continue after a direction in which the grasp is lost.
-        settled_stop: end a direction early when the objects have come to rest well inside their bounds.
     """
 
-    def __init__(self, model: Model, *, all_directions: bool = False, settled_stop: bool = True) -> None:
+    def __init__(self, model: Model, *, all_directions: bool = False) -> None:
         self._compiled, self._protocol = model, model.protocol
         self._model = model = model.own() if self._protocol.draws else model
         self._near, self._still = MujocoWorld(model, near=True), MujocoWorld(model)
@@ -44,11 +42,10 @@ class Trial:
             from lgrasp.simulate.physx_world import PhysxWorld
 
             self._world = PhysxWorld(model)
-        self._all, self._settled_stop = all_directions, settled_stop
+        self._all = all_directions
         self._timestep = model.mujoco.opt.timestep
         self._chunk = self._steps(chunk_of(self._protocol))
         self._bounds = Bounds(model.protocol)
-        self.steps = 0
 
     def _steps(self, seconds: float) -> int:
         return max(1, round(seconds / self._timestep))
@@ -93,10 +90,8 @@ class Trial:
 
     def _lift(self, rows: GraspRows, i: int, look: Look) -> Verdict:
         """Take the object of row ``i`` off its table."""
-        found = Lifted()
-        if look.depth <= self._protocol.most_penetration:
-            found = lift_row(self._world, self._model, rows, i)
-            self.steps += found.steps
+        fits = look.depth <= self._protocol.most_penetration
+        found = lift_row(self._world, self._model, rows, i) if fits else Lifted()
         return conclude_lift(self._bounds, look, found)
 
     def _close(self, rows: GraspRows, i: int, look: Look) -> Closed:
@@ -110,7 +105,7 @@ class Trial:
                 steps += round(self._protocol.rest / self._timestep)
             for step in range(steps):
                 self._world.drive(a + (b - a) * min((step + 1) / ramp, 1.0))
-                self._step(1)
+                self._world.step(1)
                 if (step + 1) % self._chunk == 0 or step + 1 == steps:
                     worst = np.maximum(worst, self._moved())
                     if self._world.wild():
@@ -124,7 +119,7 @@ class Trial:
     def _touching_at_rest(self) -> int:
         """Fewest links on any object, at rest at the targets; the trial then continues from the previous state."""
         before = self._world.state()
-        self._step(self._steps(self._protocol.settle))
+        self._world.step(self._steps(self._protocol.settle))
         touching = self._world.links_touching()
         self._world.restore(before)
         return int(touching.min())
@@ -151,13 +146,14 @@ class Trial:
         return diverged
 
     def _pull(self, load: np.ndarray, closed: Closed) -> tuple[np.ndarray, float]:
-        """Load the objects in each of T steps, over their forces, (T, 3) [world frame].
+        """Load the objects in each of T steps, over their forces, (T, 3) [world frame]; ends early where they have come
+        to rest well inside their bounds under an even load.
 
         Returns:
             How far each object moved at worst, (O, 2) [m], [rad], and the deepest penetration of any [m].
         """
         worst, depth = closed.moved, closed.depth
-        may_stop = self._settled_stop and bool((load == load[0]).all())
+        may_stop = bool((load == load[0]).all())
         done, before, total = 0, self._moved(), len(load)
         while done < total:
             steps = min(self._chunk, total - done)
@@ -180,11 +176,7 @@ class Trial:
         """One step under each load (n, 3)."""
         for some in [load] if (load == load[0]).all() else load[:, None]:
             self._world.push(self._model.forces[:, None] * some[0])
-            self._step(len(some))
-
-    def _step(self, steps: int) -> None:
-        self._world.step(steps)
-        self.steps += steps
+            self._world.step(len(some))
 
     def _look_at_q(self, rows: GraspRows, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Contact points on their links at q, (O, C, 3) in body frames [m], and links within 1 mm of each object."""

@@ -29,20 +29,20 @@ class Verdict(NamedTuple):
     """Findings on one grasp of O objects; COLUMNS and OBJECT_COLUMNS say what the numbers mean."""
 
     holds: bool
-    directions: np.ndarray  # (6,) i8
     displacement: np.ndarray  # (6,) [m]
     rotation: np.ndarray  # (6,) [rad]
-    slip: float
     contact_at_q: int
-    contact_at_grasp: int
     pregrasp_penetration: float
     settled: bool
     diverged: bool
-    stays: bool
-    penetration: float
-    object_touches: np.ndarray  # (O,) i8
-    object_displacement: np.ndarray  # (O,) [m]
-    object_rotation: np.ndarray  # (O,) [rad]
+    directions: np.ndarray = np.full(6, -1, np.int8)
+    slip: float = np.nan
+    contact_at_grasp: int = -1
+    stays: bool = False
+    penetration: float = np.nan
+    object_touches: np.ndarray = np.full(1, -1, np.int8)  # (O,)
+    object_displacement: np.ndarray = np.full(1, np.nan)  # (O,) [m]
+    object_rotation: np.ndarray = np.full(1, np.nan)  # (O,) [rad]
     share: float = np.nan  # NaN: nothing was drawn
     pushed: float = np.nan  # [m]; NaN: not lifted
     on_table: bool = False

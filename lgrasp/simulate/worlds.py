@@ -229,7 +229,6 @@ class Worlds:
         self.chunk = max(1, round(CHUNK / m.opt.timestep))
         self._graph: Any = None
         self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _BUFFER_WARNINGS)
-        self.steps = 0
         self._compile()
 
     def _compile(self) -> None:
@@ -252,7 +251,6 @@ class Worlds:
                     self._one_step()
                 else:
                     wp.capture_launch(self._graph)
-        self.steps += self.chunk * self.worlds
 
     def _one_step(self) -> None:
         wp.launch(_drive, self._d.ctrl.shape, [self._targets], [self._d.ctrl])

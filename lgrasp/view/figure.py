@@ -7,8 +7,9 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.poses import pose_from_matrix
+from lgrasp.grasp.records import ObjectRecord
 from lgrasp.hand.surface import joined_mesh
-from lgrasp.picture.draw import CONTACT, HAND, OBJECTS
+from lgrasp.picture.draw import CONTACT, HAND, OBJECTS, rgb
 from lgrasp.picture.scene import STAGES, GraspScene, HandShape, balls, split_edges
 
 if TYPE_CHECKING:
@@ -30,12 +31,6 @@ class Marks(NamedTuple):
     forces: bool = True
     cones: bool = False
     see_through: bool = False
-
-
-def rgb(colour: str) -> tuple[int, int, int]:
-    """Red, green and blue, 0 to 255, of a colour such as #ff8800."""
-    r, g, b = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
-    return r, g, b
 
 
 STAGE_MARKS = tuple((float(i), name) for i, name in enumerate(STAGES))
@@ -88,12 +83,12 @@ class GraspFigure:
         self._scene, self.name = scene, name
         self.frame = scene.add_frame(name, show_axes=False)
         self._hand: HandFigure | None = None
-        self._objects: list[tuple[trimesh.Trimesh, viser.MeshHandle]] = []
+        self._objects: list[tuple[ObjectRecord, viser.MeshHandle]] = []
         self._marks: list[viser.SceneNodeHandle] = []
         self.shown: GraspScene | None = None
         self._time = 0.0
 
-    def show(self, grasp: GraspScene, colour: int = 0) -> None:
+    def show(self, grasp: GraspScene) -> None:
         """Show another row; the posture comes with :meth:`move`."""
         if self._hand is None or self._hand.shape is not grasp.hand:
             if self._hand is not None:
@@ -103,11 +98,11 @@ class GraspFigure:
         before = self._objects
         self._objects = []
         for i, placed in enumerate(grasp.objects):
-            same = i < len(before) and before[i][0] is placed.mesh
-            colour_of = OBJECTS[(colour + i) % len(OBJECTS)]
-            node = before[i][1] if same else add_mesh(self._scene, f"{self.name}/object{i}", placed.mesh, colour_of)
+            same = i < len(before) and before[i][0] is placed.record
+            colour = OBJECTS[i % len(OBJECTS)]
+            node = before[i][1] if same else add_mesh(self._scene, f"{self.name}/object{i}", placed.mesh, colour)
             place(node, placed.pose)
-            self._objects.append((placed.mesh, node))
+            self._objects.append((placed.record, node))
         for _, node in before[len(grasp.objects) :]:
             node.remove()
         self.shown = grasp

@@ -13,9 +13,9 @@ from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import space_sides
 from lgrasp.hand.surface_visibility import visible_surface
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.picture.draw import OBJECTS
+from lgrasp.picture.draw import OBJECTS, rgb
 from lgrasp.picture.scene import HandShape
-from lgrasp.view.figure import HandFigure, add_mesh, rgb, show_all
+from lgrasp.view.figure import HandFigure, add_mesh, show_all
 from lgrasp.view.page import Aim, add_saving
 from lgrasp.view.server import View
 
@@ -40,7 +40,7 @@ class HandView(View):
         self._server, self._source, self._model, self._tree = server, source, model, model.tree
         self._lock = threading.RLock()
         self._shown: dict[str, _Nodes] = {}
-        shape = HandShape(source.urdf, self._tree.base_link, self._tree.listed_names)
+        shape = HandShape(read_urdf(source.urdf), self._tree.base_link, self._tree.listed_names)
         self._figure = HandFigure(server.scene, "/hand", shape)
         gui = server.gui
         gui.add_markdown(f"**{model.name}** {source.spec.description}")

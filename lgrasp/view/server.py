@@ -11,6 +11,7 @@ from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, NamedTuple
 
 from lgrasp.errors import ConfigError
+from lgrasp.runtime.optional import import_optional
 from lgrasp.view.front import INSIDE, Front
 
 if TYPE_CHECKING:
@@ -55,10 +56,7 @@ def open_site(host: str, port: int, title: str) -> Site:
     Raises:
         ConfigError: viser is not installed, the host is not one of this computer, or no port is free.
     """
-    try:
-        import viser
-    except ImportError:
-        raise ConfigError('the viewer needs viser, which is not installed: pip install "lgrasp[view]"') from None
+    viser = import_optional("the viewer needs viser", '"lgrasp[view]"', "viser", error=ConfigError)
     try:
         socket.create_server((host, 0)).close()
     except OSError as error:

@@ -107,7 +107,7 @@ VALID = [
 FUZZ = """
 import pickle, random, sys
 import numpy as np
-from lgrasp.dataset.exports.unpickle import UnpickleError, load_plain
+from lgrasp.dataset.exports.npy import UnpickleError, load_plain
 data = [bytes.fromhex(line) for line in open(sys.argv[1])]
 draw, read = random.Random(5), 0
 for count in range(10_000):

@@ -23,7 +23,7 @@ from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_requests
 from lgrasp.jobs.generate import generate
-from lgrasp.picture.plot import check_plot
+from lgrasp.picture.sheet import check_image
 
 OBJECTS = ("capsule", "mug", "box")
 PUBLISHED = Published(
@@ -196,14 +196,14 @@ def test_ratios_without_published_figures(table):
 def test_plot(table, tmp_path):
     for name, drawn in (("whole", table), ("bare", with_ratios(table | {"published": None}))):
         path = tmp_path / f"{name}.png"
-        check_plot(path)
+        check_image(path, (".png",))
         draw_table(drawn, path)
         assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     lost = with_ratios(table | {"cells": [cell("box", [], [], error="no such mesh")]})
     draw_table(lost, tmp_path / "lost.png")
     assert (tmp_path / "lost.png").stat().st_size > 0
     with pytest.raises(OutputError, match=r"\.png"):
-        check_plot(tmp_path / "table.pdf")
+        check_image(tmp_path / "table.pdf", (".png",))
 
 
 def test_resume_keeps_measured_cells(table, tmp_path):

@@ -177,10 +177,13 @@ def with_values(**values):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (with_values(**{"joint_1.0": np.nan}), "entry 2: qpos is not finite"),
-        (with_values(WRJTx=np.inf), "entry 2: qpos is not finite"),
+        (with_values(**{"joint_1.0": np.nan}), "entry 2: not a grasp of DexGraspNet: qpos is not finite"),
+        (with_values(WRJTx=np.inf), "entry 2: not a grasp of DexGraspNet: qpos is not finite"),
         (with_values(extra=0.0), "entry 2: has joint 'extra'; expected joint_0.0"),
-        (lambda entries: [e | {"scale": np.nan} for e in entries], "object 'tiny' has scale nan"),
+        (
+            lambda entries: [e | {"scale": np.nan} for e in entries],
+            "entry 0: not a grasp of DexGraspNet: scale is not finite",
+        ),
         (lambda entries: [e | {"scale": 1000.0} for e in entries], "90 m at scale 1000; 0.005 to 1 m is accepted"),
         (lambda entries: [], "holds no grasps"),
     ],

@@ -58,7 +58,7 @@ def test_options_replace_the_config(cli, config):
     ("changes", "words"),
     [
         ({"sceens": 3}, "unknown key 'sceens'; did you mean 'scenes'?"),
-        ({"scene": {"camera": {"elevation": [80, 20]}}}, "elevation [80, 20] is empty"),
+        ({"scene": {"camera": {"elevation": [80, 20]}}}, "the smaller number of a range comes first"),
         ({"scenes": 0}, "key 'scenes' = 0"),
         ({"hand": "nohand"}, "nohand"),
     ],

@@ -12,7 +12,7 @@ from lgrasp.hold.run import course_of
 from lgrasp.judge.meshes import clean_mesh, mass_centre
 from lgrasp.object.mass import mass_properties
 from lgrasp.object.preprocess import preprocess_object
-from lgrasp.simulate.scene import object_of_record
+from lgrasp.simulate.solid import object_of_record
 
 
 def opened(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -5,9 +5,8 @@ import pytest
 import trimesh
 
 from lgrasp.geometry.poses import pose_matrix
-from lgrasp.picture.camera import Intrinsics, look_at
+from lgrasp.picture.camera import Intrinsics, central_camera, look_at
 from lgrasp.picture.depth import NOTHING, LabelledMesh, join_surfaces, render
-from lgrasp.scenes.camera import intrinsics_of, place_cameras
 from lgrasp.scenes.params import CameraParams
 from lgrasp.scenes.render import (
     TABLE,
@@ -15,6 +14,7 @@ from lgrasp.scenes.render import (
     draw_offsets,
     image_normals,
     merge_views,
+    place_cameras,
     table_surface,
 )
 
@@ -25,7 +25,7 @@ CENTRE = np.array([0.05, -0.03, 0.2])
 
 @pytest.fixture(scope="module")
 def camera():
-    return intrinsics_of(CameraParams(width=160, height=120))
+    return central_camera(160, 120, CameraParams().angle)
 
 
 @pytest.fixture(scope="module")

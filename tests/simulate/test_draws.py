@@ -17,7 +17,8 @@ from lgrasp.simulate.draws import Draw, draw_of, tune
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.protocol import PROTOCOLS, Draws, Protocol
 from lgrasp.simulate.run import protocol_text, verdicts
-from lgrasp.simulate.scene import Scene, hand_of_record, object_of_record, scene_of
+from lgrasp.simulate.scene import Scene, hand_of_record, scene_of
+from lgrasp.simulate.solid import object_of_record
 from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")

@@ -17,7 +17,8 @@ from lgrasp.simulate.assemble import bare_urdf
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
-from lgrasp.simulate.scene import Scene, hand_of_record, object_of_record, scene_of
+from lgrasp.simulate.scene import Scene, hand_of_record, scene_of
+from lgrasp.simulate.solid import object_of_record
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 

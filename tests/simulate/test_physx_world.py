@@ -10,7 +10,8 @@ from lgrasp.simulate.model import build_model
 from lgrasp.simulate.mujoco_world import MujocoWorld
 from lgrasp.simulate.physx_world import PhysxWorld
 from lgrasp.simulate.protocol import PROTOCOLS
-from lgrasp.simulate.scene import Scene, hand_of_record, object_of_record
+from lgrasp.simulate.scene import Scene, hand_of_record
+from lgrasp.simulate.solid import object_of_record
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)

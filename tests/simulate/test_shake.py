@@ -12,10 +12,10 @@ from support.twins import twin_rows, twin_shard
 from lgrasp.choices import EngineName
 from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError, PhysicsError
+from lgrasp.simulate.lift import shake_course
 from lgrasp.simulate.protocol import GRAVITY, PROTOCOLS, Draws, Protocol, Shake
 from lgrasp.simulate.run import protocol_text
 from lgrasp.simulate.scene import scene_of
-from lgrasp.simulate.shake import shake_course
 from lgrasp.simulate.verdict import AXES
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")

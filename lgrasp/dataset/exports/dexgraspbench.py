@@ -2,15 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lgrasp.dataset.exports.folder import GRASPS, OBJECTS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_object
-from lgrasp.dataset.exports.reading import GraspSet, open_folder
+from lgrasp.dataset.exports.reading import WRONG, GraspSet, numbers, open_folder
 from lgrasp.dataset.exports.selection import Selection
+from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse
 
@@ -60,35 +60,18 @@ def read_dexgraspbench(path: Path | str, *, joint_names: Sequence[str] | None = 
     :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
     folder = open_folder(path, ".npy", "dexgraspbench", joint_names)
-    index, root, q, world = [], [], [], []
     for file in folder.files:
-        entry = next(iter(load_objects(file)), None)
-        if not isinstance(entry, dict):
-            raise ShardError(f"{file}: no dictionary of one grasp")
-        listed = tuple(map(str, entry.get("joint_names", folder.joint_names or folder.wanted)))
-        if not listed and not folder.wanted:
-            raise ShardError(f"{file}: does not name its joints; give joint_names")
-        order = folder.order(listed, file)
-        postures = [_numbers(entry, posture, 7 + len(order), file) for posture in _POSTURES]
-        root.append(postures[0][:7])
-        q.append([values[7:][order] for values in postures])
-        world.append(_numbers(entry, "obj_pose", 7, file))
-        if not (world[-1][3:].any() and root[-1][3:].any()):
-            raise ShardError(f"{file}: a quaternion is 0 0 0 0; one of unit length is accepted")
-        scale, mesh = float(_numbers(entry, "obj_scale", 1, file)[0]), entry.get("obj_path")
-        if not isinstance(mesh, str):
-            raise ShardError(f"{file}: obj_path is {mesh!r}, expected the path of a mesh")
-        index.append(folder.place(Path(mesh).stem, scale))
-    return folder.single(np.array(q), compose(inverse(np.array(world)), np.array(root)), index)
-
-
-def _numbers(entry: dict[str, Any], key: str, count: int, file: Path) -> np.ndarray:
-    try:
-        values = np.asarray(entry[key], np.float64).reshape(-1)
-    except KeyError:
-        raise ShardError(f"{file}: has no {key!r}") from None
-    except (TypeError, ValueError) as error:
-        raise ShardError(f"{file}: {key} holds no numbers: {error}") from None
-    if len(values) != count or not np.isfinite(values).all():
-        raise ShardError(f"{file}: {key} has {len(values)} numbers, expected {count}, all finite")
-    return values
+        with parsing(file, "a grasp of DexGraspBench", WRONG):
+            entry = load_objects(file)[0]
+            names = entry.get("joint_names", folder.joint_names or folder.wanted)
+            if not len(names):
+                raise ShardError(f"{file}: does not name its joints; give joint_names")
+            postures = np.stack([numbers(entry[key], key, 7 + len(names)) for key in _POSTURES])
+            world, mesh = numbers(entry["obj_pose"], "obj_pose", 7), entry["obj_path"]
+            if not world[3:].any() or not postures[0, 3:7].any():
+                raise ValueError("a quaternion is 0 0 0 0; one of unit length is accepted")
+            if not isinstance(mesh, str):
+                raise ValueError(f"obj_path is {mesh!r}, expected the path of a mesh")
+            root = compose(inverse(world), postures[0, :7])
+            folder.add(file, names, postures[:, 7:], root, Path(mesh).stem, entry["obj_scale"])
+    return folder.grasps()

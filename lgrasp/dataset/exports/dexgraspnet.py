@@ -9,9 +9,9 @@ import numpy as np
 from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.npy import load_objects, save_objects
-from lgrasp.dataset.exports.reading import GraspSet, open_folder
+from lgrasp.dataset.exports.reading import WRONG, GraspSet, numbers, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
-from lgrasp.errors import ShardError
+from lgrasp.dataset.files import parsing
 from lgrasp.geometry.poses import euler_from_quaternion, quaternion_from_euler
 
 _WRIST = ("WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz")
@@ -55,33 +55,14 @@ def read_dexgraspnet(path: Path | str, *, joint_names: Sequence[str] | None = No
     :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
     folder = open_folder(path, ".npy", "dexgraspnet", joint_names)
-    index, values = [], []
     for file in folder.files:
         for number, entry in enumerate(load_objects(file)):
             where = f"{file}: entry {number}"
-            if not isinstance(entry, dict) or not isinstance(entry.get("qpos"), dict):
-                raise ShardError(f"{where}: no dictionary with 'qpos', a dictionary of joint values")
-            folder.order([name for name in entry["qpos"] if name not in _WRIST], where)
-            values.append([_row(entry, posture, (*_WRIST, *folder.wanted), where) for posture in _POSTURES])
-            try:
-                scale = float(entry.get("scale", 1.0))
-            except (TypeError, ValueError):
-                raise ShardError(f"{where}: scale is {entry['scale']!r}, expected a number") from None
-            index.append(folder.place(file.stem, scale))
-    table = np.array(values, np.float64).reshape(len(values), 3, len(_WRIST) + len(folder.wanted))
-    wrist, q = table[:, 0, :6], table[:, :, 6:]
-    return folder.single(q, np.concatenate([wrist[:, :3], quaternion_from_euler(wrist[:, 3:])], -1), index)
-
-
-def _row(entry: dict[str, Any], posture: str, names: tuple[str, ...], where: str) -> list[float]:
-    """Wrist and joints of one posture."""
-    values = entry.get(posture, entry["qpos"])
-    try:
-        row = [float(values[name]) for name in names]
-    except KeyError as error:
-        raise ShardError(f"{where}: {posture} has no {error}") from None
-    except (TypeError, ValueError) as error:
-        raise ShardError(f"{where}: {posture} holds no numbers: {error}") from None
-    if not np.isfinite(row).all():
-        raise ShardError(f"{where}: {posture} is not finite")
-    return row
+            with parsing(where, "a grasp of DexGraspNet", WRONG):
+                names = [name for name in entry["qpos"] if name not in _WRIST]
+                folder.order(where, names)
+                values = [[entry.get(key, entry["qpos"])[name] for name in (*_WRIST, *names)] for key in _POSTURES]
+                table = numbers(values, "qpos", 3, 6 + len(names))
+                pose = np.concatenate([table[0, :3], quaternion_from_euler(table[0, 3:6])])
+                folder.add(where, names, table[:, 6:], pose, file.stem, entry.get("scale", 1.0))
+    return folder.grasps()

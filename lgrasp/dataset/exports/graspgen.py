@@ -8,7 +8,7 @@ import numpy as np
 
 from lgrasp.dataset.exports.folder import CSPACE_POSTURES, GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.dataset.exports.reading import GraspSet, open_folder
+from lgrasp.dataset.exports.reading import WRONG, GraspSet, numbers, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
@@ -73,23 +73,14 @@ def read_graspgen(path: Path | str, *, joint_names: Sequence[str] | None = None)
     :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
     folder = open_folder(path, ".json", "graspgen", joint_names)
-    index, poses, q = [], [], []
     for file in folder.files:
-        with parsing(file, "a GraspGen file", (KeyError, TypeError, ValueError)):
+        with parsing(file, "a GraspGen file", WRONG):
             document = json.loads(file.read_bytes())
-            mesh, scale, grasps = document["object"]["file"], float(document["object"]["scale"]), document["grasps"]
-            transforms = np.array(grasps["transforms"], np.float64).reshape(-1, 4, 4)
-            if not np.isfinite(transforms).all():
-                raise ValueError("a transform is not finite")
+            mesh, grasps = document["object"], document["grasps"]
             if "joint_names" not in grasps:
                 raise ShardError(f"{file}: names no joints (joint_names, cspace_position), which a hand's grasps need")
-            order = folder.order(list(map(str, grasps["joint_names"])), file)
-            at_grasp = grasps["cspace_position"]
-            postures = [np.array(grasps.get(name, at_grasp), np.float64) for name in CSPACE_POSTURES]
-            joints = np.stack(postures, 1).reshape(len(transforms), 3, len(order))
-            if not np.isfinite(joints).all():
-                raise ValueError("a joint is not finite")
-            poses.append(pose_from_matrix(transforms))
-        q.append(joints[:, :, order])
-        index += [folder.place(Path(str(mesh)).stem, scale)] * len(transforms)
-    return folder.single(np.concatenate(q), np.concatenate(poses), index)
+            T, names = numbers(grasps["transforms"], "transforms", -1, 4, 4), grasps["joint_names"]
+            postures = [(key, grasps.get(key, grasps["cspace_position"])) for key in CSPACE_POSTURES]
+            q = np.stack([numbers(values, key, len(T), len(names)) for key, values in postures], axis=1)
+            folder.add(file, names, q, pose_from_matrix(T), Path(str(mesh["file"])).stem, mesh["scale"])
+    return folder.grasps()

@@ -4,16 +4,14 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 from lgrasp.config import load_yaml
 from lgrasp.dataset.exports.folder import CSPACE_POSTURES, GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.dataset.exports.reading import GraspSet, open_folder
+from lgrasp.dataset.exports.reading import WRONG, GraspSet, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.dataset.files import parsing
-from lgrasp.errors import ShardError
 from lgrasp.files import new_file
 from lgrasp.geometry.poses import inverse
 
@@ -71,33 +69,17 @@ def read_isaac_grasp(path: Path | str, *, joint_names: Sequence[str] | None = No
     and errors as of :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
     folder = open_folder(path, ".yaml", "isaac-grasp", joint_names)
-    index, poses, q = [], [], []
     for file in folder.files:
-        with parsing(file, "an isaac_grasp file", (yaml.YAMLError, KeyError, TypeError, ValueError)):
+        with parsing(file, "an isaac_grasp file", (yaml.YAMLError, *WRONG)):
             document = load_yaml(file.read_bytes())
             version = document["format"], float(document["format_version"])
-            grasps = document["grasps"]
-        if version != ("isaac_grasp", 1.0) or not isinstance(grasps, dict):
-            raise ShardError(f"{file}: is {version[0]} {version[1]}, expected isaac_grasp 1.0 with a mapping of grasps")
-        place = folder.place(file.stem)
-        for name, entry in grasps.items():
-            where = f"{file}: {name}"
-            try:
-                turn, at_grasp = entry["orientation"], entry["cspace_position"]
-                poses.append([float(x) for x in (*entry["position"], turn["w"], *turn["xyz"])])
-                postures = [entry.get(posture, at_grasp) for posture in CSPACE_POSTURES]
-                for joints in postures:
-                    folder.order(list(map(str, joints)), where)
-                q.append([[float(joints[joint]) for joint in folder.wanted] for joints in postures])
-            except KeyError as error:
-                raise ShardError(f"{where}: has no {error}") from None
-            except (TypeError, ValueError, AttributeError) as error:
-                raise ShardError(f"{where}: not as isaac_grasp 1.0 has it: {error}") from None
-            if len(poses[-1]) != 7 or not np.isfinite(poses[-1]).all() or not np.isfinite(q[-1]).all():
-                raise ShardError(f"{where}: expected 3 numbers of position, 4 of orientation, all finite")
-            if not any(poses[-1][3:]):
-                raise ShardError(f"{where}: orientation is 0 0 0 0; a quaternion of unit length is accepted")
-            index.append([place])
-    pose = inverse(np.array(poses, np.float64).reshape(-1, 7))
-    joints = np.array(q, np.float64).reshape(-1, 3, len(folder.wanted))
-    return folder.rows(joints, pose[:, None], np.array(index, int).reshape(-1, 1))
+            if version != ("isaac_grasp", 1.0):
+                raise ValueError(f"it is {version[0]} {version[1]}, expected isaac_grasp 1.0")
+            grasps = document["grasps"].items()
+        for name, entry in grasps:
+            with parsing(where := f"{file}: {name}", "a grasp of isaac_grasp 1.0", WRONG):
+                turn, joints = entry["orientation"], entry["cspace_position"]
+                folder.order(where, joints)
+                q = [[entry.get(key, joints)[joint] for joint in joints] for key in CSPACE_POSTURES]
+                folder.add(where, joints, q, (*entry["position"], turn["w"], *turn["xyz"]), file.stem)
+    return folder.grasps(of_base=True)

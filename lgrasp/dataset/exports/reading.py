@@ -1,10 +1,10 @@
 """What the readers of exports share: the folder, and rows in the shape of a shard's, with names."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,6 +39,29 @@ class GraspSet(NamedTuple):
     link's frame where the folder names one (an export of lgrasp), else in the frame that the format gives poses of."""
 
 
+WRONG = (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError)
+"""What is raised where a file holds something else than a format has there."""
+
+
+def numbers(values: Any, what: str, *shape: int) -> np.ndarray:
+    """Finite numbers as float64 in some shape, none: one number; -1: of any length.
+
+    Raises:
+        ValueError: They are none, or too many or too few.
+    """
+    try:
+        found = np.asarray(values, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what} holds no numbers: {error}") from None
+    if not np.isfinite(found).all():
+        raise ValueError(f"{what} is not finite")
+    try:
+        return found.reshape(shape)
+    except ValueError:
+        expected = " x ".join(str(size) if size >= 0 else "n" for size in shape) or "1"
+        raise ValueError(f"{what} has {found.size} numbers, expected {expected}") from None
+
+
 def order_of(names: Sequence[str], wanted: Sequence[str], where: object) -> list[int]:
     """Place in ``names`` of each wanted joint.
 
@@ -68,11 +91,35 @@ class ExportFolder:
     """Mesh of each object by its code."""
     objects: list[ReadObject] = field(default_factory=list)
     """Those that grasps named so far."""
+    _added: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)  # q, pose and object's place
 
-    def order(self, names: Sequence[str], where: object) -> list[int]:
+    def order(self, where: object, names: Iterable[Any]) -> list[int]:
         """As :func:`order_of` the joints that are wanted."""
-        self.wanted = self.wanted or tuple(names)
-        return order_of(names, self.wanted, where)
+        listed = tuple(map(str, names))
+        self.wanted = self.wanted or listed
+        return order_of(listed, self.wanted, where)
+
+    def add(self, where: object, names: Iterable[Any], q: Any, pose: Any, code: str, scale: Any = 1.0) -> None:
+        """Take up n grasps of one object.
+
+        Args:
+            where: For messages.
+            names: Joints in the order of ``q``.
+            q: Joints [rad or m] at the grasp, before closing, and as targets that press, n x 3 x K numbers.
+            pose: Root link (or base link, see :meth:`grasps`) in the object's frame, x y z [m] qw qx qy qz, n x 7.
+            code: Of the object.
+            scale: Factor from its mesh to metres as grasped.
+
+        Raises:
+            ShardError: The joints are others than those wanted.
+            ValueError: Not so many finite numbers, or a quaternion of length 0.
+        """
+        order = self.order(where, names)
+        q = numbers(q, "joints", -1, 3, len(order))[..., order]
+        pose, scale = numbers(pose, "pose", len(q), 7), float(numbers(scale, "scale"))
+        if not pose[:, 3:].any(axis=1).all():
+            raise ValueError("a quaternion is 0 0 0 0; one of unit length is accepted")
+        self._added.append((q, pose, np.full((len(q), 1), self.place(code, scale))))
 
     def place(self, code: str, scale: float = 1.0) -> int:
         """Place of an object in ``objects``, which it is added to if it is not there."""
@@ -85,14 +132,17 @@ class ExportFolder:
         """Objects in the hand's base frame, for root links in the objects' frames; both [n, 7]; q is [n, K]."""
         return inverse(pose) if self.frames is None else self.frames.object_in_base(pose, q)
 
-    def single(self, q: np.ndarray, pose: np.ndarray, index: Sequence[int]) -> GraspSet:
-        """Rows of single objects: ``q`` as of :meth:`rows`, root links in the objects' frames [n, 7].
+    def grasps(self, *, of_base: bool = False) -> GraspSet:
+        """What was added; its poses are those of the hand's base link, or of its root link.
 
         Raises:
             ShardError: The folder has other joints.
         """
+        nothing = np.zeros((0, 3, len(self.wanted))), np.zeros((0, 7)), np.zeros((0, 1), int)
+        q, pose, index = map(np.concatenate, zip(nothing, *self._added, strict=True))
         order = order_of(self.wanted, self.joint_names or self.wanted, self.path)
-        return self.rows(q, self.object_pose(pose, q[:, 0][:, order])[:, None], np.array(index, int).reshape(-1, 1))
+        object_pose = inverse(pose) if of_base else self.object_pose(pose, q[:, 0][:, order])
+        return self.rows(q, object_pose[:, None], index)
 
     def rows(self, q: np.ndarray, object_pose: np.ndarray, object_index: np.ndarray) -> GraspSet:
         """Rows in the dtypes of a shard.

@@ -10,13 +10,14 @@ from trimesh import Trimesh
 from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames, free_name
 from lgrasp.dataset.exports.mjcf import Cut
-from lgrasp.dataset.exports.reading import GraspSet, open_folder
+from lgrasp.dataset.exports.reading import WRONG, GraspSet, numbers, open_folder
 from lgrasp.dataset.exports.selection import ExportObject, Selection
 from lgrasp.dataset.files import parsing
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.files import temporary_folder, write_file
 from lgrasp.geometry.poses import inverse, pose_from_matrix, pose_matrix
 from lgrasp.picture.scene import HandShape
+from lgrasp.runtime.optional import import_optional
 
 _POSTURES = ("grasp", "pregrasp", "squeeze")
 _HAND = "/World/hand"
@@ -39,15 +40,8 @@ def import_pxr() -> Any:
     Raises:
         ConfigError: they are not installed.
     """
-    try:
-        import pxr.Gf
-        import pxr.Sdf
-        import pxr.Tf
-        import pxr.Usd
-        import pxr.UsdGeom
-    except ImportError:
-        raise ConfigError('format usd needs usd-core, which is not installed: pip install "lgrasp[usd]"') from None
-    return pxr
+    modules = ("pxr", "Gf", "Sdf", "Tf", "Usd", "UsdGeom")
+    return import_optional("format usd needs usd-core", '"lgrasp[usd]"', *modules, error=ConfigError)
 
 
 class UsdWriter:
@@ -87,8 +81,10 @@ class UsdWriter:
         for posture in _POSTURES:
             variants.AddVariant(posture)
         ops: dict[str, Any] = {}
+        taken: list[str] = []
         for link, mesh in self._shape.links.items():
-            path = f"{_HAND}/{free_name(self._pxr.Tf.MakeValidIdentifier(link), '', _last(ops))}"
+            taken.append(free_name(self._pxr.Tf.MakeValidIdentifier(link), "", taken))
+            path = f"{_HAND}/{taken[-1]}"
             ops[link] = geom.Xform.Define(stage, path).AddTransformOp()
             self._mesh(stage, f"{path}/mesh", mesh)
         hand.CreateAttribute("lgrasp:jointNames", types.StringArray).Set(list(self._frames.joint_names))
@@ -136,29 +132,21 @@ class UsdWriter:
             made.CreateExtentAttr(np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]).astype(np.float32))
 
 
-def _last(ops: dict[str, Any]) -> list[str]:
-    """Names of the prims that have transforms."""
-    return [op.GetAttr().GetPrim().GetName() for op in ops.values()]
-
-
 def read_usd(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:
     """Read an export of lgrasp, or stages of one; arguments and errors as of
     :func:`~lgrasp.dataset.exports.formats.read_grasps`."""
     usd = import_pxr().Usd
     folder = open_folder(path, ".usdc", "usd", joint_names)
-    index, poses, q = [], [], []
     for file in folder.files:
-        with parsing(file, "a stage of USD", (RuntimeError, TypeError, ValueError)):
+        with parsing(file, "a stage of USD", (RuntimeError, *WRONG)):
             stage = usd.Stage.Open(str(file))
             hand = stage.GetPrimAtPath(_HAND)
             names = hand.GetAttribute("lgrasp:jointNames").Get() if hand else None
             if not names:
                 raise ShardError(f"{file}: names no joints ({_HAND}, lgrasp:jointNames); stages of lgrasp are read")
-            order = folder.order(list(map(str, names)), file)
             root = hand.GetAttribute("lgrasp:root")
             times = root.GetTimeSamples()
-            joints = np.array([[hand.GetAttribute(f"lgrasp:{name}").Get(t) for name in _POSTURES] for t in times])
-            poses.append(pose_from_matrix(np.array([root.Get(t) for t in times]).reshape(-1, 4, 4).mT))
-        q.append(joints[:, :, order])
-        index += [folder.place(file.stem)] * len(times)
-    return folder.single(np.concatenate(q), np.concatenate(poses), index)
+            q = [[hand.GetAttribute(f"lgrasp:{name}").Get(t) for name in _POSTURES] for t in times]
+            T = numbers([root.Get(t) for t in times], "lgrasp:root", -1, 4, 4)
+            folder.add(file, names, q, pose_from_matrix(T.mT), file.stem)
+    return folder.grasps()

@@ -15,7 +15,7 @@ import numpy as np
 
 from lgrasp.dataset.exports.folder import GRASPS
 from lgrasp.dataset.exports.hand import HandFrames
-from lgrasp.dataset.exports.reading import GraspSet, open_folder
+from lgrasp.dataset.exports.reading import WRONG, GraspSet, numbers, open_folder
 from lgrasp.dataset.exports.selection import Batch, Selection
 from lgrasp.dataset.files import parsing
 from lgrasp.errors import ConfigError, ShardError
@@ -122,23 +122,16 @@ def read_webdataset(path: Path | str, *, joint_names: Sequence[str] | None = Non
     :func:`~lgrasp.dataset.exports.formats.read_grasps`.
     """
     folder = open_folder(path, ".tar", "webdataset", joint_names)
-    listed = tuple(folder.joint_names or folder.wanted)
-    if not listed:
+    names = folder.joint_names or folder.wanted
+    if not names:
         raise ShardError(f"{folder.path}: does not name its joints; give joint_names")
-    index, poses, q = [], [], []
+    what = "a WebDataset of grasps", (tarfile.TarError, EOFError, *WRONG)
     for file in folder.files:
-        order = folder.order(listed, file)
-        wrong = (tarfile.TarError, KeyError, TypeError, ValueError, AttributeError, EOFError, RecursionError)
-        with parsing(file, "a WebDataset of grasps", wrong), tarfile.open(file, "r:") as tar:
+        with parsing(file, *what), tarfile.open(file, "r:") as tar:
             _check_whole(file)
             for member in tar:
-                entry = json.load(tar.extractfile(member))  # ty: ignore[invalid-argument-type]
-                pose, joints = np.array(entry["hand_pose"], float), np.array([entry[n] for n in POSTURES], float)
-                if pose.shape != (7,) or joints.shape != (3, len(listed)) or not pose[3:].any():
-                    raise ValueError(f"{member.name} has poses or joints of other lengths")
-                if not (np.isfinite(pose).all() and np.isfinite(joints).all()):
-                    raise ValueError(f"{member.name} has numbers that are not finite")
-                poses.append(pose)
-                q.append(joints[:, order])
-                index.append(folder.place(str(entry["object"])))
-    return folder.single(np.array(q).reshape(-1, 3, len(listed)), np.array(poses).reshape(-1, 7), index)
+                with parsing(f"{file}: {member.name}", *what):
+                    entry = json.load(tar.extractfile(member))  # ty: ignore[invalid-argument-type]
+                    q = [numbers(entry[key], key, len(names)) for key in POSTURES]
+                    folder.add(file, names, q, entry["hand_pose"], str(entry["object"]))
+    return folder.grasps()

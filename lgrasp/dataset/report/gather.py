@@ -8,8 +8,7 @@ from functools import reduce
 import numpy as np
 
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.report.coverage import Coverage
-from lgrasp.dataset.report.diversity import GraspSpread, TouchedSurface
+from lgrasp.dataset.report.diversity import Coverage, GraspSpread, TouchedSurface
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.verdicts import HeldRows, Verdicts, add_held, add_verdicts
 from lgrasp.geometry.poses import pose_matrix
@@ -165,7 +164,8 @@ class HandRows:
             add_held(self.held, rows)
             for index in np.unique(rows.object_index, axis=0):
                 chosen = np.flatnonzero((rows.object_index == index).all(1))
-                self._add_rows(rows, chosen, index, records, labels, strict)
+                held = [(slot, labels[k], records[k]) for slot, k in enumerate(index) if k >= 0]
+                self._add_rows(rows, chosen, held, strict)
             advanced(start + len(rows))
 
     def together(self) -> dict[str, Distribution]:
@@ -198,17 +198,10 @@ class HandRows:
             group.near.close()
 
     def _add_rows(
-        self,
-        rows: GraspRows,
-        chosen: np.ndarray,
-        index: np.ndarray,
-        records: tuple[ObjectRecord, ...],
-        labels: list[str],
-        strict: bool,
+        self, rows: GraspRows, chosen: np.ndarray, held: list[tuple[int, str, ObjectRecord]], strict: bool
     ) -> None:
-        """Some rows, by their numbers, that hold the same objects in the same order, ``index`` [O]."""
-        present = np.flatnonzero(index >= 0)
-        names = tuple(labels[index[o]] for o in present)
+        """Some rows, by their numbers, that hold the same objects in the same slots."""
+        slots, names = [slot for slot, _, _ in held], tuple(name for _, name, _ in held)
         group = self.objects.setdefault(names, ObjectRows(names, NearRows(self._device)))
         group.rows += len(chosen)
         for name, distribution in group.quantities.items():
@@ -218,16 +211,16 @@ class HandRows:
                 distribution.missing += len(chosen)
         group.contacts.update((rows.contact_links[chosen] >= 0).sum((1, 2)).tolist())
         q, pose = rows.q[chosen], rows.object_pose[chosen]
-        group.near.add(pose[:, present], q)
+        group.near.add(pose[:, slots], q)
         middles = []
-        for o, name in zip(present, names, strict=True):
-            vertices = np.asarray(records[index[o]].vertices, float)
+        for o, name, record in held:
+            vertices = np.asarray(record.vertices, float)
             middle = (vertices.min(0) + vertices.max(0)) / 2
             T = pose_matrix(pose[:, o].astype(float))
             middles.append(group.coverage.setdefault(name, Coverage()).add(T, middle))
             group.spread.setdefault(name, GraspSpread(self.hand, self.locked)).add(T, q.astype(float))
             if name not in group.touched:
-                group.touched[name] = TouchedSurface(records[index[o]])
+                group.touched[name] = TouchedSurface(record)
             contacts = (rows.contact_points[chosen, o], rows.contact_normals[chosen, o])
             group.touched[name].add(*(values.reshape(-1, 3) for values in contacts))
         add_verdicts(group.verdicts, rows, chosen)

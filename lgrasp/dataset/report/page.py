@@ -6,7 +6,7 @@ from typing import Any
 
 import jinja2
 
-from lgrasp.dataset.report.coverage import principal_postures
+from lgrasp.dataset.report.diversity import principal_postures
 from lgrasp.dataset.report.gather import HandRows
 from lgrasp.dataset.report.plots import (
     MAPS,
@@ -129,13 +129,11 @@ def _histograms(hand: HandRows) -> list[Block]:
 
 
 def _physics(data: dict[str, Any]) -> list[Block]:
-    total: dict[str, dict[str, dict[str, int]]] = {}
+    total: dict[str, dict[str, Counter[str]]] = {}
     for group in data["objects"]:
         for name, verdicts in group["physics"].items():
-            into = total.setdefault(name, {})
             for way, counts in verdicts["directions"].items():
-                found = into.get(way, {"run": 0, "failed": 0})
-                into[way] = {key: found[key] + counts[key] for key in found}
+                total.setdefault(name, {}).setdefault(way, Counter()).update(counts)
     tried = [(name, ways) for name, ways in total.items() if any(way["run"] for way in ways.values())]
     text = "Of the grasps run in a direction; a grasp that failed in one may not have been run in the others."
     chart = [_figure(failure_chart(tried), text)] if tried else []

@@ -2,14 +2,14 @@
 
 import io
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lgrasp.dataset.report.coverage import Posture
+from lgrasp.dataset.report.diversity import Posture
 from lgrasp.dataset.report.quantity import Distribution
 
 MAPS = 12
@@ -85,7 +85,7 @@ def contact_chart(group: dict[int, int], links: dict[str, float]) -> str:
         return svg()
 
 
-def failure_chart(rows: list[tuple[str, dict[str, dict[str, int]]]]) -> str:
+def failure_chart(rows: Sequence[tuple[str, Mapping[str, Mapping[str, int]]]]) -> str:
     """Share of the grasps that fail in each direction, a group of bars per direction, a colour per protocol."""
     with _figure(10, 2.8) as (figure, svg):
         axes = figure.subplots()

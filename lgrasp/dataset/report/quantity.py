@@ -85,9 +85,7 @@ class Distribution:
         return self.quantity.top * self.quantity.factor * np.linspace(0, 1, _HISTOGRAM_CELLS + 1) ** 4
 
     def quantile(self, share: float) -> float:
-        """Value below which a share of the rows lies, in the shown unit."""
-        if not self.rows:
-            return np.nan
+        """Value below which a share of the rows lies, in the shown unit; there are rows."""
         ends = np.concatenate([[0], np.cumsum(self.counts)])
         return float(np.clip(np.interp(share * self.rows, ends, self.edges()), self.least, self.most))
 
@@ -101,10 +99,8 @@ class Distribution:
         return edges, np.histogram(np.minimum(middle, edges[-1]), edges, weights=counts)[0]
 
     def numbers(self) -> dict[str, Any]:
-        """JSON-serialisable: worst, median and more, in ``unit``."""
+        """JSON-serialisable: worst, median and more, in ``unit``; there are rows."""
         q = self.quantity
-        if not self.rows:
-            return {"unit": q.unit, "rows": 0, "missing": self.missing}
         return {
             "unit": q.unit,
             "rows": self.rows,

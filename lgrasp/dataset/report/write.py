@@ -10,7 +10,7 @@ from lgrasp.dataset.files import Paths
 from lgrasp.dataset.info import SURVIVORS, asked_type, stage_counts, survivors
 from lgrasp.dataset.merge import sum_statistics
 from lgrasp.dataset.reader import ShardReader
-from lgrasp.dataset.report.coverage import principal_postures
+from lgrasp.dataset.report.diversity import principal_postures
 from lgrasp.dataset.report.gather import HandRows, ObjectRows
 from lgrasp.dataset.report.page import page
 from lgrasp.dataset.report.quantity import Distribution

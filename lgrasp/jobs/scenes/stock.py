@@ -25,7 +25,7 @@ from lgrasp.object.find import find_object
 from lgrasp.object.load import load_mesh
 from lgrasp.runtime.device import Device
 from lgrasp.scenes.make import Item
-from lgrasp.simulate.scene import object_of_record
+from lgrasp.simulate.solid import object_of_record
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def test_others_dexgraspbench(tmp_path):
     np.save(tmp_path / "0.npy", np.array(entry, object))
     with pytest.raises(ShardError, match=r"0\.npy: does not name its joints"):
         read_dexgraspbench(tmp_path)
-    with pytest.raises(ShardError, match="has 9 numbers, expected 10"):
+    with pytest.raises(ShardError, match="grasp_qpos has 9 numbers, expected 10"):
         read_dexgraspbench(tmp_path, joint_names=["a", "b", "c"])
     read = read_dexgraspbench(tmp_path, joint_names=["a", "b"])
     assert [(o.code, o.scale) for o in read.objects] == [("core_mug", pytest.approx(0.06))]
@@ -149,10 +149,11 @@ def test_others_isaac_grasp(tmp_path):
     for old, new, words in [
         ("format_version: 1.0", "format_version: 2.0", "expected isaac_grasp 1.0"),
         ("isaac_grasp", "other", "expected isaac_grasp 1.0"),
-        ("position: [-0.04346,", "position: [", "3 numbers of position"),
-        ("orientation", "turn", "grasp_0: has no 'orientation'"),
-        ("[-0.04346", "[x", "could not convert"),
-        ("{panda_finger_joint1: 0.04}", "{finger: 0.04}", "lacks joint 'panda_finger_joint1'"),
+        ("position: [-0.04346,", "position: [", "pose has 6 numbers, expected 1 x 7"),
+        ("position: [-0.04346,", "position: [1, 2, 3, 4, 5, 6, 7, 8,", "pose has 14 numbers, expected 1 x 7"),
+        ("orientation", "turn", "grasp_0: not a grasp of isaac_grasp 1.0: it has no 'orientation'"),
+        ("[-0.04346", "[x", "pose holds no numbers: could not convert"),
+        ("{panda_finger_joint1: 0.04}", "{finger: 0.04}", "it has no 'panda_finger_joint1'"),
         ("grasps:", "grasps: [", "not an isaac_grasp file"),
     ]:
         (tmp_path / "mug.yaml").write_text(ISAAC.replace(old, new))
@@ -165,12 +166,14 @@ def test_others_isaac_grasp(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"obj_pose": None}, "has no 'obj_pose'"),
-        ({"obj_pose": np.zeros(3)}, "has 3 numbers, expected 7"),
-        ({"grasp_qpos": np.full(9, np.nan)}, "all finite"),
+        ({"obj_pose": None}, "it has no 'obj_pose'"),
+        ({"obj_pose": np.zeros(3)}, "obj_pose has 3 numbers, expected 7"),
+        ({"grasp_qpos": np.full(9, np.nan)}, "grasp_qpos is not finite"),
         ({"joint_names": ["a", "c"]}, "lacks joint 'b'"),
         ({"obj_path": 3}, "obj_path is 3"),
-        ({"squeeze_qpos": "text"}, "holds no numbers"),
+        ({"obj_scale": "big"}, "scale holds no numbers"),
+        ({"obj_scale": np.nan}, "scale is not finite"),
+        ({"squeeze_qpos": "text"}, "squeeze_qpos holds no numbers"),
     ],
 )
 def test_wrong_dexgraspbench(tmp_path, changes, words):
@@ -184,17 +187,20 @@ def test_wrong_dexgraspbench(tmp_path, changes, words):
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ({}, "entry 0: no dictionary with 'qpos'"),
-        ({"qpos": {"a": 1.0}}, "qpos has no 'WRJTx'"),
-        ({"qpos": {"WRJTx": "x"}}, "qpos"),
+        ({}, "entry 0: not a grasp of DexGraspNet: it has no 'qpos'"),
+        ({"qpos": {"a": 1.0}}, "it has no 'WRJTx'"),
+        ({"qpos": {"WRJTx": "x"}}, "it has no 'WRJTy'"),
         ({"qpos": dict.fromkeys(["WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz", "b"], 0.0)}, "lacks joint 'a'"),
-        ({"qpos": dict.fromkeys(["WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz", "a"], np.nan)}, "not finite"),
+        (
+            {"qpos": dict.fromkeys(["WRJTx", "WRJTy", "WRJTz", "WRJRx", "WRJRy", "WRJRz", "a"], np.nan)},
+            "qpos is not finite",
+        ),
     ],
 )
 def test_wrong_dexgraspnet(tmp_path, entry, words):
     save_objects(tmp_path / "a.npy", 1, [entry])
     with pytest.raises(ShardError, match=words):
-        read_dexgraspnet(tmp_path / "a.npy", joint_names=None if "qpos" in words else ["a"])
+        read_dexgraspnet(tmp_path / "a.npy", joint_names=["a"] if "lacks" in words else None)
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import read_shard
-from lgrasp.dataset.report.coverage import Coverage, principal_postures
+from lgrasp.dataset.report.diversity import Coverage, principal_postures
 from lgrasp.dataset.report.gather import EvenSample
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.write import read_dataset, report_dataset
