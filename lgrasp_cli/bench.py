@@ -360,15 +360,13 @@ def _refuse_options(context: typer.Context) -> None:
 def _measure(table: "Comparison", config: "JobConfig", cache: "Cache", file: str | None = None) -> "Comparison":
     """The table with all its cells; written to the file after each."""
     from lgrasp.bench.comparison import cell_line, measure_table
-    from lgrasp.bench.rate import Bench
     from lgrasp.engine.report import write_json
 
-    with Bench() as runs:
-        measured = measure_table(runs, table, config, cache, progress=say)
-        for table, cell in measured:
-            if file:
-                write_json(file, table)
-            say(cell_line(table, cell))
+    for latest, cell in measure_table(table, config, cache, progress=say):
+        table = latest
+        if file:
+            write_json(file, table)
+        say(cell_line(table, cell))
     return table
 
 

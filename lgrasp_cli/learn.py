@@ -128,7 +128,7 @@ def evaluate(
     shards_below(shards)
     path, cache = find_network(predictor), open_cache(cache_dir)
     if (kind := read_card(path)["kind"]) == "grasp":
-        from lgrasp.jobs.learn.grasp_eval import evaluate as measure_plans
+        from lgrasp.jobs.learn.grasp import evaluate as measure_plans
 
         data = measure_plans(path, shards, cache, clouds=clouds, starts=starts, seed=seed, device=device, out=out)
         return Answer(data, [] if quiet else [_plans(data)])
@@ -139,7 +139,7 @@ def evaluate(
 
         data = measure(path, shards, cache, seed=seed, device=device)
         return Answer(data, [] if quiet else [_draws(data)])
-    from lgrasp.jobs.learn.coarse_eval import evaluate as run
+    from lgrasp.jobs.learn.job import evaluate as run
 
     data = run(path, shards, cache, clouds=clouds, seed=seed, device=device)
     return Answer(data, [] if quiet else [_coarse(data)])

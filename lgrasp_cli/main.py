@@ -17,14 +17,12 @@ from lgrasp.notices import on_notice
 from lgrasp_cli import bench, cache, catalog, dataset, hands, learn, prepare, scenes
 from lgrasp_cli.generate import generate
 from lgrasp_cli.look import render, view
+from lgrasp_cli.many import run
 from lgrasp_cli.options import old_name, warn
-from lgrasp_cli.plan import plan
-from lgrasp_cli.reach import reach
-from lgrasp_cli.refine import refine
+from lgrasp_cli.plan import plan, refine
 from lgrasp_cli.renamed import renew
-from lgrasp_cli.run import run
 from lgrasp_cli.sequence import sample, sequence
-from lgrasp_cli.simulate import simulate
+from lgrasp_cli.simulate import reach, simulate
 from lgrasp_cli.status import status
 from lgrasp_cli.submit import WORDS, submit
 

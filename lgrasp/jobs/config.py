@@ -28,8 +28,8 @@ from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.request import Request, named
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
-from lgrasp.hand.names import all_hands, hand_path, known_hands
-from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest
+from lgrasp.hand.names import all_hands
+from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest, hand_name
 from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
 from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object
@@ -157,12 +157,7 @@ def load_requests(name: str, changes: dict[str, Any]) -> ConfigJobs:
     if kind == "generate" or "sequences" in data:
         return ConfigJobs(plan_requests(parse_model(JobConfig, data, f"config {path}")), devices)
     data.pop("description", None)
-    model = named(KINDS[kind])
-    usual = "out" not in data and issubclass(model, SequenceRequest)
-    request = parse_model(model, data | ({"out": Path()} if usual else {}), f"config {path}")
-    if usual:
-        request.out = sequence_folder(request.hand, request.names, request.pipeline, request.simulate)
-    return ConfigJobs([request], devices)
+    return ConfigJobs([parse_model(named(KINDS[kind]), data, f"config {path}")], devices)
 
 
 def plan_requests(config: JobConfig) -> list[Request]:
@@ -252,25 +247,6 @@ def _names(hand: str, mesh: str, called: Callable[[str], str]) -> tuple[str, str
         names = names[0], find_object(mesh).stem
         names = called(hand), names[1]
     return names
-
-
-def sequence_folder(hand: str, objects: Sequence[str], pipeline: Pipeline, protocol: str | None) -> Path:
-    """Where the shards of sequences go unless it is said."""
-    return run_folder(Path("grasps"), hand_name(hand), sequence_name(tuple(objects)), pipeline.name, protocol)
-
-
-def hand_name(hand: str) -> str:
-    """What a hand is called in the names of folders.
-
-    Raises:
-        HandError: there is no such hand.
-    """
-    if hand in known_hands():  # one of the catalogue is called by its folder
-        return hand
-    hand_path(hand)
-    from lgrasp.jobs.hands import hand_source  # slow to load: only for what is there
-
-    return hand_source(hand).name
 
 
 def _pipelines(config: JobConfig) -> Iterator[Pipeline]:

@@ -2,7 +2,7 @@
 
 import json
 import time
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -31,19 +31,16 @@ class ReachJob(ReachRequest, VerdictJob):
     version: ClassVar[int] = 3
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.hand.pairs",)
 
-    _arm: Arm | None = PrivateAttr(None)
     _solids: dict[str, "ArmSolids"] = PrivateAttr(default_factory=dict)  # by hand
 
-    @property
+    @cached_property
     def described(self) -> Arm:
         """The arm of the URDF.
 
         Raises:
             HandError: it cannot be used.
         """
-        if self._arm is None:
-            self._arm = read_arm(self.arm, self.tip, pose_matrix(self.mount.pose))
-        return self._arm
+        return read_arm(self.arm, self.tip, pose_matrix(self.mount.pose))
 
     @property
     def verdict(self) -> tuple[str, str]:

@@ -140,7 +140,7 @@ def test_without_a_plan_the_shard_is_empty_and_stays(plan, tmp_path):
     cloud = Cloud((0.8 * n).astype("f4"), n.astype("f4"), None, np.ones(len(n), bool), ())
     few = {"cloud": cloud, "starts": 2, "params": PlanParams(rolls=8, finalists=2)}
     outcome = plan(tmp_path / "out", **few)
-    assert outcome.rows == outcome.results[0]["counts"]["kept"] == 0
+    assert outcome.rows == outcome.job.report(outcome)["counts"]["kept"] == 0
     assert not validate_shard(outcome.paths[0])
     again = plan(tmp_path / "out", **few)
     assert (again.results, again.paths) == ([], outcome.paths)

@@ -13,13 +13,14 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.run import run
 from lgrasp.errors import HandError
 from lgrasp.files import temporary_folder, write_file
 from lgrasp.hand.fingers import finger_label
 from lgrasp.hand.opposition.facing import space_opening, space_postures
 from lgrasp.hand.opposition.spaces import hand_spaces, longest, space_sides
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hand_check.diagnose import diagnose, hand_findings
 from lgrasp.jobs.hand_check.pictures import draw_hand, draw_palmar, draw_spaces, draw_workspace
 from lgrasp.picture.sheet import image_bytes
@@ -120,7 +121,7 @@ def check_hand(
                 shard_rows=rows,
                 cache=cache,
             )
-            outcome = generate(job, events)
+            outcome = run(job, events)
             inputs = job.inputs
             done = outcome.results[0]
             reasons = diagnose(inputs, done.counts, outcome.rows, rows)

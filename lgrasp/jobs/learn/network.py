@@ -1,6 +1,7 @@
 """What the jobs that train a network on shards and keep it in one file share."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,6 +20,8 @@ from lgrasp.jobs.requests.shards import FitRequest
 from lgrasp.learn.networks import open_network, read_card
 
 if TYPE_CHECKING:  # torch takes a second to import
+    import torch
+
     from lgrasp.learn.curve import Curves
     from lgrasp.learn.diffuser.training import StepTrainer
 
@@ -80,21 +83,23 @@ class NetworkJob(FitRequest, FileJob):
 def training_report(
     hand: str,
     trainer: "StepTrainer",
-    objects: list[str],
-    unseen: list[str],
+    objects: Sequence[str],
+    unseen: "torch.Tensor",
     seconds: dict[str, float],
     curves: "Curves",
 ) -> dict[str, Any]:
     """What is said of a network that draws hands: what it learnt from, its losses, the time it took [s].
 
     Args:
-        unseen: objects that were held out, of ``objects`` none.
+        objects: names, those of several sizes several times.
+        unseen: which of them were held out, (O,) bool.
     """
     loss, held_out = trainer.losses()
+    kinds = list(zip(objects, unseen.tolist(), strict=True))
     return {
         "hand": hand,
-        "objects": objects,
-        "unseen": unseen,
+        "objects": sorted({name for name, held in kinds if not held}),
+        "unseen": sorted({name for name, held in kinds if held}),
         "examples": len(trainer.examples),
         "loss": loss,
         "unseen_loss": None if np.isnan(held_out) else held_out,

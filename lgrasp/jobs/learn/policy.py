@@ -2,6 +2,7 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -40,22 +41,19 @@ class PolicyJob(PolicyRequest, FileJob):
 
     differs: ClassVar[str] = "another hand, other objects or parameters"
 
-    _keys: InputKeys | None = PrivateAttr(None)
     _field: FieldArrays | None = PrivateAttr(None)
     _hand: HandArrays | None = PrivateAttr(None)
 
-    @property
+    @cached_property
     def learned(self) -> Pipeline:
         """The pipeline whose grasps count, with several poses of each candidate."""
         return for_hand(self.pipeline.with_params("place", policy=None, proposals=3), self.hand)
 
-    @property
+    @cached_property
     def keys(self) -> InputKeys:
         """Content keys of hand and field."""
-        if self._keys is None:
-            source, pipeline = hand_source(self.hand), self.pipeline
-            self._keys = input_keys(source, None, 1.0, pipeline.object, pipeline.field, pipeline.hand)
-        return self._keys
+        source, pipeline = hand_source(self.hand), self.pipeline
+        return input_keys(source, None, 1.0, pipeline.object, pipeline.field, pipeline.hand)
 
     def key(self) -> str:
         params = self.learned.object

@@ -3,24 +3,39 @@
 import math
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from pydantic import Field, ValidationInfo, model_validator
 
 from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
 from lgrasp.config import HandName, Negatives, OtherSeed, Params, ShardFolder, Viewpoint, parse_model
-from lgrasp.engine.folder import check_number
+from lgrasp.engine.folder import check_number, run_folder
 from lgrasp.engine.pipeline import NamedPipeline, Pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
-from lgrasp.hand.names import hand_path
+from lgrasp.hand.names import hand_path, known_hands
+from lgrasp.jobs.sets import sequence_name
 from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import NO_TABLE, PROTOCOLS, find_protocol
+
+
+def hand_name(hand: str) -> str:
+    """What a hand is called in the names of folders.
+
+    Raises:
+        HandError: there is no such hand.
+    """
+    if hand in known_hands():  # one of the catalogue is called by its folder
+        return hand
+    hand_path(hand)
+    from lgrasp.jobs.hands import hand_source  # slow to load: only for what is there
+
+    return hand_source(hand).name
 
 
 class SearchRequest(Request):
@@ -118,6 +133,7 @@ class SequenceRequest(SearchRequest):
         default=(), description="Names or mesh files, in the order in which they are grasped."
     )
     rows: int = Field(default=256, description="Complete sequences requested.")
+    out: ShardFolder = Field(default=Path(), description="Default: grasps/HAND-OBJECT-OBJECT.../PIPELINE.")
     scale: str = Field(
         default="1",
         coerce_numbers_to_str=True,
@@ -131,12 +147,19 @@ class SequenceRequest(SearchRequest):
     @model_validator(mode="before")
     @classmethod
     def _choose(cls, asked: Any, info: ValidationInfo) -> Any:
-        if not isinstance(asked, dict) or isinstance(asked.get("pipeline"), Pipeline):
+        if not isinstance(asked, dict):
             return asked
         own, where = SequencePipeline.model_fields, (info.context or {}).get("where", cls.usual)
         chosen = {"pipeline": cls.usual} | {name: value for name, value in asked.items() if name in own}
         made = parse_model(SequencePipeline, chosen, where).made()
         return {name: value for name, value in asked.items() if name not in own} | {"pipeline": made}
+
+    @model_validator(mode="after")
+    def _usual_folder(self) -> Self:
+        if "out" not in self.model_fields_set:
+            named = hand_name(self.hand), sequence_name(self.names)
+            self.out = run_folder(Path("grasps"), *named, self.pipeline.name, self.simulate)
+        return self
 
     @property
     def title(self) -> str:

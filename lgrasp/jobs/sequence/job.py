@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -44,13 +45,11 @@ class SequenceJob(SequenceRequest, SearchJob):
     def protocol(self) -> str | None:
         return self.simulate
 
-    @property
+    @cached_property
     def keys(self) -> SequenceKeys:
         """Content keys of hand, views, fields and objects."""
-        if self._keys is None:
-            pipeline, size = self.pipeline, parse_size(self.scale)
-            self._keys = sequence_keys(self.hand, self.objects, size, pipeline.seed, pipeline.object, pipeline.field)
-        return self._keys
+        pipeline, size = self.pipeline, parse_size(self.scale)
+        return sequence_keys(self.hand, self.objects, size, pipeline.seed, pipeline.object, pipeline.field)
 
     @property
     def object_hashes(self) -> set[str] | None:
