@@ -95,8 +95,8 @@ def generate(
     from lgrasp.jobs.config import pair_requests
     from lgrasp.object.find import all_objects
 
-    chosen = choose_pipeline(pipeline, seed, contacts, settings).with_passes(passes)
-    chosen = chosen.with_params("search", score=score) if score else chosen
+    chosen = choose_pipeline(pipeline, seed, contacts, settings)
+    chosen = chosen.with_params("search", **given(passes=passes, score=score))
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     chosen = chosen.with_table() if table else chosen
     chosen = chosen.with_steering(

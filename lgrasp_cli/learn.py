@@ -67,17 +67,15 @@ def fit(
     from lgrasp.errors import ConfigError
     from lgrasp.jobs.requests.learn import PolicyRequest
     from lgrasp.jobs.requests.shards import DiffuserRequest, FitRequest, GraspRequest
-    from lgrasp.learn.diffuser.params import DiffuserParams
-    from lgrasp.learn.grasp.params import GraspParams
-    from lgrasp.learn.params import LearnParams, PosePolicyParams
 
     kinds: dict[str, Any] = {
-        "coarse": (FitRequest, LearnParams, _show_fit),
-        "diffuser": (DiffuserRequest, DiffuserParams, _show_steps),
-        "grasp": (GraspRequest, GraspParams, _show_grasps),
-        "pose": (PolicyRequest, PosePolicyParams, _show_policy),
+        "coarse": (FitRequest, _show_fit),
+        "diffuser": (DiffuserRequest, _show_steps),
+        "grasp": (GraspRequest, _show_grasps),
+        "pose": (PolicyRequest, _show_policy),
     }
-    request, kind, show = kinds[model]
+    all_params: dict[str, Any] = {name: taken.model_fields["params"].annotation for name, (taken, _) in kinds.items()}
+    (request, show), kind = kinds[model], all_params[model]
     asked: dict[str, Any] = given(hand=hand, objects=objects or None, pipeline=pipeline)
     if model == "pose" and shards:
         raise ConfigError(f"learn fit: {shards[0]}: a pose policy takes no shards, but --hand and --object")
@@ -91,7 +89,7 @@ def fit(
         asked["pipeline"] = choose_pipeline(pipeline)
     chosen = given(steps=steps, joint_steps=joint_steps, unrolled=unrolled, batch=batch, seed=seed)
     for name in chosen.keys() - kind.model_fields:
-        takers = ", ".join(other for other, (_, params, _) in kinds.items() if name in params.model_fields)
+        takers = ", ".join(other for other, params in all_params.items() if name in params.model_fields)
         raise ConfigError(
             f"learn fit: --{name.replace('_', '-')} is for --model {takers}; "
             f"--set {model}.KEY=VALUE takes {', '.join(kind.model_fields)}"

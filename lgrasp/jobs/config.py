@@ -177,7 +177,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
     for pipeline in _pipelines(config):
         if not sets:
             meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
-            own = pipeline.with_passes(config.passes)
+            own = pipeline.with_params("search", passes=config.passes) if config.passes else pipeline
             own = own.with_table() if config.table else own
             more = config.model_dump(include={"scale", "batch", "negatives"})
             found += pair_requests(hands, meshes, own, config.out, **shared, **more)
