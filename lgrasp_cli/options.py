@@ -1,7 +1,7 @@
 """Options that several commands share, with one wording each."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -112,6 +112,15 @@ def with_options(run: Any, command: Any) -> Callable[..., None]:
     run.__signature__ = inspect.Signature(parameters)
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run
+
+
+def options_of(command: Any, words: Sequence[str]) -> set[str]:
+    """Names of the options of the command, below another, that the words of a command line begin with."""
+    for word in words:
+        if (below := getattr(command, "commands", {}).get(word)) is None:
+            break
+        command = below
+    return {name for parameter in command.params for name in parameter.opts}
 
 
 def old_name(command: Callable[..., None], old: str, new: str) -> Callable[..., None]:

@@ -193,7 +193,7 @@ def make_shard(
     if account:
         found.restore(account)
     start = time.time()
-    fixed = _fixed_batch(context, execution)
+    fixed = execution.batch or (_PHYSICS_BATCH if context.scene and device == "cpu" else 0)  # 0: as many as seem best
     most = _GPU_LARGEST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups, pipeline)
 
     def size(running: int) -> int:
@@ -270,13 +270,6 @@ def make_shard(
     elif bank and account:
         bank.discard()
     return result
-
-
-def _fixed_batch(context: Context, execution: Execution) -> int:
-    """Candidates of every batch; 0: as many as seem best."""
-    if execution.batch == 0 and context.scene and context.device == "cpu":
-        return _PHYSICS_BATCH
-    return execution.batch
 
 
 class _Rows:

@@ -70,7 +70,7 @@ class Attack:
     moment: float
     """When, as a share of the duration of an uninterrupted run."""
     code: int = 0
-    """Exit code of the command that was ended, negative for a signal."""
+    """Exit code of the command that was ended, negative for a signal; 0: it was done before."""
     early: bool = False
     """The command line was not loaded yet."""
     seconds: float = 0.0
@@ -78,11 +78,6 @@ class Attack:
     left_at_once: list[str] = field(default_factory=list)
     """Files and folders that only the second run took away."""
     faults: list[str] = field(default_factory=list)
-
-    @property
-    def died(self) -> bool:
-        """False if the command was done before."""
-        return self.code != 0
 
 
 class Soak:

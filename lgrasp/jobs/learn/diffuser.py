@@ -32,10 +32,6 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
 
     kind: ClassVar[tuple[str, int]] = (KIND, VERSION)
 
-    @property
-    def effort_steps(self) -> int:
-        return self.params.steps
-
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, start = self.params, time.perf_counter()
         found = read_steps(self.shards, self.cache, self.device_used, p.cloud)

@@ -61,10 +61,7 @@ class GraspJob(GraspRequest, NetworkJob):
     """A one-object predictor; the report has the losses of both networks."""
 
     kind: ClassVar[tuple[str, int]] = (KIND, VERSION)
-
-    @property
-    def effort_steps(self) -> int:
-        return self.params.completion_steps + self.params.steps
+    steps: ClassVar[tuple[str, ...]] = ("completion_steps", "steps")
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, alias, start = self.params, self.device_used.alias, time.perf_counter()

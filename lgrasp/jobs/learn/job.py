@@ -50,10 +50,7 @@ class FitJob(NetworkJob):
     """
 
     kind: ClassVar[tuple[str, int]] = ("coarse", 2)
-
-    @property
-    def effort_steps(self) -> int:
-        return self.params.steps + self.params.joint_steps
+    steps: ClassVar[tuple[str, ...]] = ("steps", "joint_steps")
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, device = self.params, self.device_used.alias

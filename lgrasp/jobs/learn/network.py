@@ -1,6 +1,5 @@
 """What the jobs that train a network on shards and keep it in one file share."""
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -48,6 +47,8 @@ class NetworkJob(FitRequest, FileJob):
     differs: ClassVar[str] = "other shards or parameters"
     kind: ClassVar[tuple[str, int]]
     """Name and version of what is trained."""
+    steps: ClassVar[tuple[str, ...]] = ("steps",)
+    """The parameters that are its numbers of steps."""
 
     _key: str | None = PrivateAttr(None)
 
@@ -58,13 +59,8 @@ class NetworkJob(FitRequest, FileJob):
             self._key = content_key(*self.kind, rows=rows, params=described, hand=self.hand)
         return self._key
 
-    @property
-    @abstractmethod
-    def effort_steps(self) -> int:
-        """Steps of the training."""
-
     def parts(self) -> list[Part]:
-        return [Part(0, self.out, self.effort_steps)]
+        return [Part(0, self.out, sum(getattr(self.params, name) for name in self.steps))]
 
     def enough(self, count: int, what: str, least: int) -> None:
         """Raises ConfigError if there are too few grasps, or what else is learnt from."""

@@ -1,6 +1,5 @@
 """What is asked of the jobs that search grasps by a pipeline."""
 
-import math
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -42,20 +41,16 @@ class SearchRequest(Request):
     """Shards of grasps by one hand, perhaps of fewer rows than requested."""
 
     hand: HandName = "allegro"
-    rows: int = Field(default=1000, description="Rows requested.")
+    rows: int = Field(default=1000, ge=1, description="Rows requested.")
     pipeline: NamedPipeline
     out: ShardFolder
-    shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
+    shard_rows: int = Field(default=10_000, ge=1, description="Rows of a shard; part of what decides the rows.")
 
     @property
     def known_parts(self) -> int:
         return -(-self.rows // self.shard_rows)
 
     def check(self) -> None:
-        if self.rows <= 0:
-            raise ConfigError(f"-n {self.rows}: request at least 1")
-        if self.shard_rows <= 0:
-            raise ConfigError(f"--shard-rows {self.shard_rows}: must be at least 1")
         check_number(self.known_parts, "shards; use larger --shard-rows or several --out")
         for what, asked in {"place.table": self.pipeline.on_table, "steer": self.pipeline.steer.asks}.items():
             if asked and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
@@ -78,19 +73,20 @@ class GenerateRequest(SearchRequest):
 
     object: str = Field(description="Name or mesh file.")
     scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
-    batch: int = Field(default=0, description="Candidates per batch; 0: as suits the device.")
+    batch: int = Field(default=0, ge=0, description="Candidates per batch; 0: as suits the device.")
     negatives: Negatives = 0.0
-    rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
+    rate: float = Field(
+        default=1.0,
+        gt=0,
+        allow_inf_nan=False,
+        description="Rows expected per candidate by the first shard; never changes rows.",
+    )
 
     @property
     def title(self) -> str:
         return f"{Path(self.hand).stem} {Path(self.object).stem} {self.pipeline.name}"
 
     def check(self) -> None:
-        if self.batch < 0:
-            raise ConfigError(f"--batch {self.batch}: must be at least 0 (0: by device)")
-        if not 0 < self.rate < math.inf:
-            raise ConfigError(f"rate {self.rate}: the rows expected per candidate must be positive and finite")
         if self.pipeline.sequence is not None:
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ..."
@@ -132,7 +128,7 @@ class SequenceRequest(SearchRequest):
     objects: tuple[str, ...] = Field(
         default=(), description="Names or mesh files, in the order in which they are grasped."
     )
-    rows: int = Field(default=256, description="Complete sequences requested.")
+    rows: int = Field(default=256, ge=1, description="Complete sequences requested.")
     out: ShardFolder = Field(default=Path(), description="Default: grasps/HAND-OBJECT-OBJECT.../PIPELINE.")
     scale: str = Field(
         default="1",
@@ -142,7 +138,7 @@ class SequenceRequest(SearchRequest):
     simulate: ProtocolName | None = Field(
         default=None, description="Protocol that the rows of every step must pass to be continued."
     )
-    shard_rows: int = Field(default=1000, description="Sequences of a shard; part of what decides the rows.")
+    shard_rows: int = Field(default=1000, ge=1, description="Sequences of a shard; part of what decides the rows.")
 
     @model_validator(mode="before")
     @classmethod
