@@ -22,6 +22,7 @@ from lgrasp_cli.options import (
     choose_pipeline,
     given,
     open_cache,
+    set_option,
     split,
     warn,
 )
@@ -237,11 +238,7 @@ def bench_refine(
     noise: Annotated[bool, Option("--noise/--no-noise", help="Also measure table IV: clouds with noise.")] = True,
     settings: Annotated[
         list[str] | None,
-        Option(
-            "--set",
-            metavar="PART.KEY=VALUE",
-            help="Set a parameter of the plans, such as bounds.friction=0.8 or plan.finalists=5; repeatable.",
-        ),
+        set_option(help="Set a parameter of the plans, such as bounds.friction=0.8 or plan.finalists=5; repeatable."),
     ] = None,
     device: Device = "auto",
     json_path: JsonPath = None,

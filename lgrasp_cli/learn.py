@@ -29,8 +29,7 @@ def fit(
         Option("--out", "-o", help="File of the network; default: coarse.pt, diffuser.pt, grasp.pt or policy.npz."),
     ] = None,
     steps: Annotated[
-        int | None,
-        Option(help="Training steps; default: 1500 (coarse) or 20000; grasp: after grasp.completion_steps."),
+        int | None, Option(help="Training steps; default: 1500 (coarse) or 20000; grasp: after grasp.completion_steps.")
     ] = None,
     joint_steps: Annotated[
         int | None, Option(help="Training steps through the refiner afterwards (coarse); default: 80.")
@@ -45,12 +44,10 @@ def fit(
     ] = None,
     hand: Annotated[str | None, Option(help="Hand of a pose policy; default: allegro.", **HAND)] = None,
     objects: Annotated[
-        list[str] | None,
-        Option("--object", help="Objects of a pose policy; default: random shapes.", **OBJECT),
+        list[str] | None, Option("--object", help="Objects of a pose policy; default: random shapes.", **OBJECT)
     ] = None,
     pipeline: Annotated[
-        str | None,
-        Option("--pipeline", "-p", help="Pipeline of a pose policy; default: robust.", **PIPELINE),
+        str | None, Option("--pipeline", "-p", help="Pipeline of a pose policy; default: robust.", **PIPELINE)
     ] = None,
     seed: Annotated[int, Option(help="Seed of examples, weights and batches.")] = 0,
 ) -> None:
@@ -264,9 +261,7 @@ def _learnt_from(report: dict[str, Any]) -> str:
 
 
 def _show_fit(data: dict[str, Any]) -> list[Block]:
-    pairs = [
-        ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
-    ]
+    pairs = [("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}")]
     words = (
         ("frozen", "trained on poses"),
         ("longer", "on poses as many steps more"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Argument, Option
 
+from lgrasp.words import number
 from lgrasp_cli.names import CONFIG, OBJECTS
 from lgrasp_cli.options import DryRun, given
 from lgrasp_cli.tables import TextTable, print_report
@@ -81,17 +82,11 @@ def _run_one(request: "Request", how: How) -> dict[str, Any]:
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:
-    if "asked" not in result:
-        return (result["title"], result["unit"], "-", "-", "-", "-", result["status"])
-    return (
-        result["title"],
-        result["unit"],
-        f"{result['asked']:,}",
-        f"{result['made'] + result['present']:,}",
-        f"{result['seconds']['total']:.1f}",
-        f"{result['strict_valid_per_s']:,.0f}" if "strict_valid_per_s" in result else "-",
-        result["status"],
-    )
+    numbers = ["-"] * 4
+    if "asked" in result:
+        numbers[:2] = f"{result['asked']:,}", f"{result['made'] + result['present']:,}"
+        numbers[2:] = f"{result['seconds']['total']:.1f}", number(result.get("strict_valid_per_s"))
+    return (result["title"], result["unit"], *numbers, result["status"])
 
 
 @working

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -31,13 +32,10 @@ JsonPath = Annotated[
     str | None,
     Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
 ]
+set_option = partial(Option, "--set", metavar="PART.KEY=VALUE")
+"""Of commands whose parameters have other names."""
 Settings = Annotated[
-    list[str] | None,
-    Option(
-        "--set",
-        metavar="PART.KEY=VALUE",
-        help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.",
-    ),
+    list[str] | None, set_option(help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.")
 ]
 Viewpoint = Annotated[
     str | None, Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")

@@ -55,22 +55,9 @@ def plan(
     """
     from lgrasp.jobs.requests.plan import PlanRequest, plan_params
 
-    what: dict[str, Any] = {
-        "hand": hand,
-        "object": mesh,
-        "scale": scale,
-        "cloud": cloud,
-        "mask": mask,
-        "label": label,
-        "out": out,
-    }
-    what |= {
-        "viewpoint": position(viewpoint),
-        "starts": starts,
-        "model": model,
-        "stand_off": stand_off,
-        "keep_invalid": keep_invalid,
-    }
+    what: dict[str, Any] = {"object": mesh, "scale": scale, "cloud": cloud, "mask": mask, "label": label}
+    what |= {"viewpoint": position(viewpoint), "hand": hand, "model": model, "starts": starts, "stand_off": stand_off}
+    what |= {"keep_invalid": keep_invalid, "out": out}
     params = plan_params(settings or (), distal=distal, other=other)
     how.run(how.job(PlanRequest, "plan", **what, params=params), _show)
 

@@ -126,8 +126,7 @@ def reach(
         ),
     ],
     mount: Annotated[
-        str | None,
-        Option(metavar="X,Y,Z[:R,P,Y]", help="Pose of the hand's base link in the tip's frame."),
+        str | None, Option(metavar="X,Y,Z[:R,P,Y]", help="Pose of the hand's base link in the tip's frame.")
     ] = None,
     tip: Annotated[str | None, Option(metavar="LINK", help="Link that carries the hand; default: the last.")] = None,
     tries: Annotated[int | None, Option(min=1, help="Starting postures per pose.")] = None,

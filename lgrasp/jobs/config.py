@@ -29,8 +29,8 @@ from lgrasp.engine.request import Request, named
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.hand.names import all_hands
-from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest, hand_name
-from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
+from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest, hand_name, sequence_name
+from lgrasp.jobs.sets import SequenceSets, object_sequences
 from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object
 from lgrasp.steer.params import Steering

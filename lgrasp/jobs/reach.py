@@ -104,10 +104,6 @@ class ReachJob(ReachRequest, VerdictJob):
             self._solids[hand.sha256] = ArmSolids(self.described, base_pieces(hand, cut), cut)
         return self._solids[hand.sha256]
 
-    def write(self, part: Part, contents: Any) -> None:
-        key, added = contents
-        self.extend(part, key, **added)
-
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``arm``, ``tip``, ``joints``; ``results``: of each hand and object ``rows`` and how many of them are
         ``reached``, or what they lack (``no_posture``, ``no_way``, ``hits_table``, ``hits_itself``)."""

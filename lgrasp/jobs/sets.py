@@ -68,8 +68,3 @@ def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list
             drawn[tuple(rng.permutation(members).tolist())] = None
         out += [tuple(pool[i] for i in order) for order in drawn]
     return out
-
-
-def sequence_name(objects: tuple[str, ...]) -> str:
-    """OBJECT-OBJECT..., for files and folders."""
-    return "-".join(Path(name).stem for name in objects)

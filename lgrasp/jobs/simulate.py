@@ -1,7 +1,7 @@
 """Simulates the rows of shards and adds the verdicts to them, or to copies."""
 
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,7 +43,6 @@ class SimulateJob(SimulateRequest, VerdictJob):
 
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)
-    _scene: tuple[Hashable, Scene] | None = PrivateAttr(None)  # the latest
 
     @property
     def verdict(self) -> tuple[str, str]:
@@ -112,8 +111,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         self._kept.close()
 
     def write(self, part: Part, contents: Any) -> None:
-        kept, key, added = contents
-        self.extend(part, key, **added)
+        kept, *made = contents
+        super().write(part, made)
         kept.discard()
 
     def kept_of(self, part: Part) -> int:
@@ -155,16 +154,19 @@ class SimulateJob(SimulateRequest, VerdictJob):
 
     def _scene_of(self, hand: HandRecord, objects: Sequence[ObjectRecord]) -> Scene:
         """What is simulated of a shard: hand and objects cut into convex pieces."""
+        alias = self.device_used.alias
         planes = [b"" if record.tables is None else record.tables.tobytes() for record in objects]
-        key = (hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
-        if self._scene is None or self._scene[0] != key:
-            scene = scene_of(hand, objects, partial(decompose, store=self.cache), self.device_used.alias)
+        key = (alias, hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
+
+        def make() -> Scene:
+            scene = scene_of(hand, objects, partial(decompose, store=self.cache), alias)
             for line in (f"object {solid.name}: {note}" for solid in scene.objects for note in solid.notes):
                 if line not in self._said:
                     self._said.add(line)
                     self.cache.warn(line)
-            self._scene = key, scene
-        return self._scene[1]
+            return scene
+
+        return self.cache.kept.get("scene", key, make)
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,7 @@ class Place:
     def digests(self) -> dict[str, str]:
         """Of each file's contents, "" for folders, by path; of the cache only what is new, and no empty folders."""
         cached = [path for path in tree(self.cache) if (self.cache / path).is_file() and path not in self.given]
-        paths = [
-            *(path for path in tree(self.folder) if not path.startswith("cache")),
-            *(f"cache/{p}" for p in cached),
-        ]
+        paths = [*(path for path in tree(self.folder) if not path.startswith("cache")), *(f"cache/{p}" for p in cached)]
         return {path: digest(self.folder / path) for path in paths}
 
     def processes(self, session: int, patience: float) -> list[str]:
@@ -212,13 +209,7 @@ class Soak:
 
 
 def soak(
-    soak: Soak,
-    commands: Sequence[str],
-    ways: Sequence[str],
-    *,
-    rounds: int = 1,
-    hours: float = 0.0,
-    seed: int = 0,
+    soak: Soak, commands: Sequence[str], ways: Sequence[str], *, rounds: int = 1, hours: float = 0.0, seed: int = 0
 ) -> Iterator[Attack]:
     """End every command in every way, each time at another moment of its duration.
 

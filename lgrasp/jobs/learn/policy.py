@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import PrivateAttr
 
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
@@ -41,9 +40,6 @@ class PolicyJob(PolicyRequest, FileJob):
 
     differs: ClassVar[str] = "another hand, other objects or parameters"
 
-    _field: FieldArrays | None = PrivateAttr(None)
-    _hand: HandArrays | None = PrivateAttr(None)
-
     @cached_property
     def learned(self) -> Pipeline:
         """The pipeline whose grasps count, with several poses of each candidate."""
@@ -75,20 +71,22 @@ class PolicyJob(PolicyRequest, FileJob):
     def about(self) -> dict[str, Any]:
         return {"hand": self.keys.source.name, "objects": list(self.objects), "pipeline": self.pipeline.name}
 
-    def load(self, events: Events, missing: bool) -> None:
-        if not missing:
-            return
-        self.pipeline.import_stages()
-        load, alias = Loader(self.cache, self.device_used.alias, events.loading), self.device_used.alias
+    @cached_property
+    def loaded(self) -> tuple[HandArrays, FieldArrays]:
+        """Hand and field on the device."""
+        load, alias = Loader(self.cache, self.device_used.alias, self.events.loading), self.device_used.alias
         model = load.hand(self.keys.source, self.keys.hand, self.pipeline.hand)
-        self._hand = upload_hand(model, alias, self.pipeline.hand.thumb)
-        self._field = upload_field(load.field(self._hand, self.keys.field, self.pipeline.field), model, alias)
+        hand = upload_hand(model, alias, self.pipeline.hand.thumb)
+        return hand, upload_field(load.field(hand, self.keys.field, self.pipeline.field), model, alias)
+
+    def load(self, events: Events, missing: bool) -> None:
+        if missing:
+            self.pipeline.import_stages()
+            _ = self.loaded
 
     def make(self, part: Part, progress: PartProgress) -> Made:
-        assert self._hand is not None
-        assert self._field is not None
-        p, hand = self.params, self._hand.model
-        points = reach_points(self._field.model, p.seed)
+        p, hand = self.params, self.loaded[0].model
+        points = reach_points(self.loaded[1].model, p.seed)
         start = time.perf_counter()
         examples: list[PoseExamples] = []
         with ThreadPoolExecutor(self.threads()) as pool:
@@ -126,12 +124,8 @@ class PolicyJob(PolicyRequest, FileJob):
         return Made(part.rows, policy_bytes(made), report)
 
     def _examples(self, number: int, points: np.ndarray) -> PoseExamples:
-        assert self._hand is not None
-        assert self._field is not None
-        p, alias = self.params, self.device_used.alias
-        obj = upload_object(self._object(number), alias)
-        learned = self.learned
-        parts = self._hand, obj, self._field, alias, p.seed, number
+        p, alias, learned, (hand, field) = self.params, self.device_used.alias, self.learned, self.loaded
+        parts = hand, upload_object(self._object(number), alias), field, alias, p.seed, number
         context = Context(*parts, bounds=learned.bounds, realised=learned.realised)
         return make_pose_examples(learned, self.pipeline.without("adjust", "close"), context, points, p)
 

@@ -39,17 +39,16 @@ class CompareRequest(Request):
 
     hands: HandNames
     objects: tuple[str, ...] = Field(
-        default=("bottle", "box", "capsule", "mug"), min_length=1, description="Names, paths, folders, or globs."
+        ("bottle", "box", "capsule", "mug"), min_length=1, description="Names, paths, folders, or globs."
     )
-    rows: int = Field(default=200, ge=1, description="Grasps per hand and object.")
+    rows: int = Field(200, ge=1, description="Grasps per hand and object.")
     vary: tuple[str, ...] = Field(
-        default=(),
-        description="KIND:VALUES, a variant of each hand per value; kinds: joint_limit, link_scale, finger_spacing.",
+        (), description="KIND:VALUES, a variant of each hand per value; kinds: joint_limit, link_scale, finger_spacing."
     )
-    simulate: ProtocolName | None = Field(default=None, description="Protocol by which grasps are simulated.")
-    pipeline: str = Field(default="robust", description="Name or path.")
+    simulate: ProtocolName | None = Field(None, description="Protocol by which grasps are simulated.")
+    pipeline: str = Field("robust", description="Name or path.")
     seed: OtherSeed = None
-    out: Path = Field(default=Path("compare"), description="Folder for the folders HAND-OBJECT/PIPELINE and the page.")
+    out: Path = Field(Path("compare"), description="Folder for the folders HAND-OBJECT/PIPELINE and the page.")
 
     @field_validator("vary", mode="before")
     @classmethod

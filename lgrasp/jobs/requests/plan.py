@@ -26,27 +26,25 @@ class PlanRequest(Request):
     unit: ClassVar[str] = "starts"
 
     hand: str = Field(
-        default="allegro", description="Name, path, or a shard (its hand); default: the model's hand, else allegro."
+        "allegro", description="Name, path, or a shard (its hand); default: the model's hand, else allegro."
     )
-    out: Path | None = Field(default=None, description="Folder of the plans; default: plans/HAND-OBJECT.")
-    starts: int = Field(default=80, ge=1, description="Points of the surface to start from.")
-    object: str | None = Field(default=None, description="Name, mesh file, or a shard of one object.")
-    scale: float = Field(default=1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
-    cloud: Path | None = Field(default=None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene.")
-    mask: Path | None = Field(default=None, description="Labels of the cloud's points (.npy, .npz).")
-    label: int | None = Field(default=None, description="Label of the points to grasp.")
+    out: Path | None = Field(None, description="Folder of the plans; default: plans/HAND-OBJECT.")
+    starts: int = Field(80, ge=1, description="Points of the surface to start from.")
+    object: str | None = Field(None, description="Name, mesh file, or a shard of one object.")
+    scale: float = Field(1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
+    cloud: Path | None = Field(None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene.")
+    mask: Path | None = Field(None, description="Labels of the cloud's points (.npy, .npz).")
+    label: int | None = Field(None, description="Label of the points to grasp.")
     viewpoint: Viewpoint = None
     model: str | None = Field(
-        default=None,
+        None,
         description="File of lgrasp learn fit --model grasp, or a name of lgrasp learn list, that draws hands to start "
         "from.",
     )
     stand_off: float | None = Field(
-        default=None, gt=0, le=1, description="Of the hand's base from a start [m]; default: the hand's."
+        None, gt=0, le=1, description="Of the hand's base from a start [m]; default: the hand's."
     )
-    keep_invalid: bool = Field(
-        default=False, description="The best of a start is kept where it fails too, metric valid 0."
-    )
+    keep_invalid: bool = Field(False, description="The best of a start is kept where it fails too, metric valid 0.")
     params: PlanParams = Field(default_factory=PlanParams)
 
     @model_validator(mode="before")

@@ -11,11 +11,10 @@ from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
 from lgrasp.config import HandName, Negatives, OtherSeed, Params, ShardFolder, Viewpoint, parse_model
 from lgrasp.engine.folder import check_number, run_folder
 from lgrasp.engine.pipeline import NamedPipeline, Pipeline
-from lgrasp.engine.request import Request
+from lgrasp.engine.request import Request, named
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path, known_hands
-from lgrasp.jobs.sets import sequence_name
 from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
@@ -32,19 +31,22 @@ def hand_name(hand: str) -> str:
     if hand in known_hands():  # one of the catalogue is called by its folder
         return hand
     hand_path(hand)
-    from lgrasp.jobs.hands import hand_source  # slow to load: only for what is there
+    return named("lgrasp.jobs.hands:hand_source")(hand).name  # slow to load: only for what is there
 
-    return hand_source(hand).name
+
+def sequence_name(objects: tuple[str, ...]) -> str:
+    """OBJECT-OBJECT..., for files and folders."""
+    return "-".join(Path(name).stem for name in objects)
 
 
 class SearchRequest(Request):
     """Shards of grasps by one hand, perhaps of fewer rows than requested."""
 
     hand: HandName = "allegro"
-    rows: int = Field(default=1000, ge=1, description="Rows requested.")
+    rows: int = Field(1000, ge=1, description="Rows requested.")
     pipeline: NamedPipeline
     out: ShardFolder
-    shard_rows: int = Field(default=10_000, ge=1, description="Rows of a shard; part of what decides the rows.")
+    shard_rows: int = Field(10_000, ge=1, description="Rows of a shard; part of what decides the rows.")
 
     @property
     def known_parts(self) -> int:
@@ -72,11 +74,11 @@ class GenerateRequest(SearchRequest):
     maker: ClassVar[str] = "lgrasp.jobs.generate:GenerateJob"
 
     object: str = Field(description="Name or mesh file.")
-    scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
-    batch: int = Field(default=0, ge=0, description="Candidates per batch; 0: as suits the device.")
+    scale: float = Field(1.0, gt=0, description="Factor from the mesh's unit to metres.")
+    batch: int = Field(0, ge=0, description="Candidates per batch; 0: as suits the device.")
     negatives: Negatives = 0.0
     rate: float = Field(
-        default=1.0,
+        1.0,
         gt=0,
         allow_inf_nan=False,
         description="Rows expected per candidate by the first shard; never changes rows.",
@@ -125,20 +127,18 @@ class SequenceRequest(SearchRequest):
     maker: ClassVar[str] = "lgrasp.jobs.sequence.job:SequenceJob"
     unit: ClassVar[str] = "sequences"
 
-    objects: tuple[str, ...] = Field(
-        default=(), description="Names or mesh files, in the order in which they are grasped."
-    )
-    rows: int = Field(default=256, ge=1, description="Complete sequences requested.")
-    out: ShardFolder = Field(default=Path(), description="Default: grasps/HAND-OBJECT-OBJECT.../PIPELINE.")
+    objects: tuple[str, ...] = Field((), description="Names or mesh files, in the order in which they are grasped.")
+    rows: int = Field(256, ge=1, description="Complete sequences requested.")
+    out: ShardFolder = Field(Path(), description="Default: grasps/HAND-OBJECT-OBJECT.../PIPELINE.")
     scale: str = Field(
-        default="1",
+        "1",
         coerce_numbers_to_str=True,
         description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.",
     )
     simulate: ProtocolName | None = Field(
-        default=None, description="Protocol that the rows of every step must pass to be continued."
+        None, description="Protocol that the rows of every step must pass to be continued."
     )
-    shard_rows: int = Field(default=1000, ge=1, description="Sequences of a shard; part of what decides the rows.")
+    shard_rows: int = Field(1000, ge=1, description="Sequences of a shard; part of what decides the rows.")
 
     @model_validator(mode="before")
     @classmethod
@@ -199,10 +199,10 @@ class SampleRequest(SequenceRequest):
 
     model: str = Field(description="File of lgrasp learn fit --model diffuser, or a name of lgrasp learn list.")
     clouds: tuple[Path, ...] = Field(
-        default=(), description="Point clouds (.ply .xyz .npy .npz .h5) in place of objects, in their order."
+        (), description="Point clouds (.ply .xyz .npy .npz .h5) in place of objects, in their order."
     )
-    masks: tuple[Path, ...] = Field(default=(), description="Labels of each cloud's points (.npy, .npz).")
-    labels: tuple[int, ...] = Field(default=(), description="Label of the points to grasp in each cloud.")
+    masks: tuple[Path, ...] = Field((), description="Labels of each cloud's points (.npy, .npz).")
+    labels: tuple[int, ...] = Field((), description="Label of the points to grasp in each cloud.")
     viewpoint: Viewpoint = None
 
     @model_validator(mode="before")

@@ -16,13 +16,12 @@ from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
-from lgrasp.jobs.requests.search import SequenceRequest
+from lgrasp.jobs.requests.search import SequenceRequest, sequence_name
 from lgrasp.jobs.search import SearchJob
 from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.records import object_records, sequence_rows
 from lgrasp.jobs.sequence.round import Steps, Verdicts, add_steps
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
-from lgrasp.jobs.sets import sequence_name
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.cores import cores
 from lgrasp.runtime.kept import Keeper
