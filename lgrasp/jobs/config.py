@@ -168,7 +168,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
             for the sequences.
     """
     objects, sets = _objects(config), config.sequences
-    drawn = object_sequences(objects, sets, config.seed or 0) if sets else [(mesh,) for mesh in objects]
+    drawn = object_sequences(objects, sets, config.seed or 0) if sets else []
     hands = [_urdf_in_folder(config.hand_dir, hand) for hand in all_hands(config.hands)]
     shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
     found: list[Request] = []
@@ -182,20 +182,15 @@ def plan_requests(config: JobConfig) -> list[Request]:
             more = config.model_dump(include={"scale", "batch", "negatives"})
             found += pair_requests(hands, meshes, own, config.out, **shared, **more)
             continue
-        changes = {name: value for name in ("method", "policy") if (value := getattr(sets, name))}
-        own = pipeline.with_params("sequence", **changes) if changes else pipeline
-        what: dict[str, Any] = {
-            "shard_rows": min(config.shard_rows, 1000),
-            "scale": sets.scale,
-            "simulate": sets.simulate,
-        }
+        what = shared | sets.model_dump(include={"scale", "simulate", "method", "policy"})
+        what |= {"shard_rows": min(config.shard_rows, 1000), "pipeline": pipeline}
         for hand, names in itertools.product(hands, drawn):
             meshes = tuple(in_folder(config.object_dir, mesh) for mesh in names)
             called = _names(hand, meshes[0], known_name)[0]
             out = run_folder(config.out, called, sequence_name(names), pipeline.name, sets.simulate)
             if (other := takers.setdefault(out, hand)) != hand:
                 raise ConfigError(_one_folder(other, hand, out))
-            found.append(SequenceRequest(**shared | what, hand=hand, objects=meshes, pipeline=own, out=out))
+            found.append(SequenceRequest(**what, hand=hand, objects=meshes, out=out))
     return found
 
 

@@ -32,7 +32,7 @@ from lgrasp.jobs.config import pair_requests
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.metrics import HOLD, MetricsJob
-from lgrasp.jobs.requests.compare import CompareRequest, Variation
+from lgrasp.jobs.requests.compare import CompareRequest, Variation, parse_variations
 from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.object.find import all_objects
 from lgrasp.simulate.protocol import find_protocol
@@ -49,20 +49,6 @@ class ComparedHand(NamedTuple):
     of: str
     """Name of the hand that it is, or is a variant of."""
     variation: Variation | None
-
-
-def compared_hands(names: Sequence[str], variations: Sequence[Variation], cache: Cache) -> list[ComparedHand]:
-    """Each hand followed by its variants, which are written into the cache where they are missing.
-
-    Raises:
-        HandError: there is no such hand, or it cannot be varied so.
-    """
-    found = []
-    for name in all_hands(names):
-        own = hand_source(name).name
-        found.append(ComparedHand(own, name, own, None))
-        found += [_varied(name, variation, cache) for variation in variations]
-    return found
 
 
 def _varied(name: str, variation: Variation, cache: Cache) -> ComparedHand:
@@ -92,8 +78,17 @@ class CompareJob(CompareRequest, Job):
 
     @cached_property
     def compared(self) -> list[ComparedHand]:
-        """The hands, each followed by its variants."""
-        return compared_hands(self.hands, self.variations(), self.cache)
+        """The hands, each followed by its variants, which are written into the cache where they are missing.
+
+        Raises:
+            HandError: there is no such hand, or it cannot be varied so.
+        """
+        found = []
+        for name in all_hands(self.hands):
+            own = hand_source(name).name
+            found.append(ComparedHand(own, name, own, None))
+            found += [_varied(name, variation, self.cache) for variation in parse_variations(self.vary)]
+        return found
 
     @cached_property
     def pairs(self) -> list[tuple[ComparedHand, GenerateJob]]:

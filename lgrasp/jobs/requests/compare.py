@@ -60,7 +60,7 @@ class CompareRequest(Request):
         return " ".join(Path(name).stem for name in (*self.hands, *self.objects))
 
     def check(self) -> None:
-        self.variations()
+        parse_variations(self.vary)
         for name in all_hands(self.hands):
             hand_path(name)
         for name in all_objects(self.objects):
@@ -68,14 +68,6 @@ class CompareRequest(Request):
         if load_pipeline(self.pipeline).sequence is not None:
             raise ConfigError(f"pipeline '{self.pipeline}' is for several objects; choose one that generates grasps")
         check_folder(self.out)
-
-    def variations(self) -> list[Variation]:
-        """The variants of each hand.
-
-        Raises:
-            ConfigError: an unknown kind, or a factor out of range.
-        """
-        return parse_variations(self.vary)
 
 
 def parse_variations(texts: Sequence[str]) -> list[Variation]:
