@@ -87,7 +87,7 @@ class Listing:
             self._mark.enter_context(working_on(self._root, self.run.run_key))
         for folder, own in self.folders.items():
             remove_leftovers(folder, TEMPORARY)
-            known = _entries(folder, self.run)
+            known = _manifest(folder).entries(self.run)
             there = {part.number for part in own if part.number in present}
             shards = []
             for part in self._every[folder]:
@@ -155,20 +155,17 @@ class Listing:
 
 def begun_array(parts: Sequence[Part]) -> str:
     """The array of SLURM that began the run of some parts, as the manifest tells; "" if none did."""
-    with suppress(ShardError):
-        for part in parts[:1]:
-            manifest = read_manifest(part.file.parent / MANIFEST)
-            runs = manifest.runs if manifest else []
-            return next((r.array for r in runs if any(s.file == part.file.name for s in r.shards)), None) or ""
+    for part in parts[:1]:
+        runs = _manifest(part.file.parent).runs
+        return next((r.array for r in runs if any(s.file == part.file.name for s in r.shards)), None) or ""
     return ""
 
 
-def _entries(folder: Path, run: ListedRun) -> dict[str, ListedShard]:
-    """What the manifest of a folder says of the files of a run."""
+def _manifest(folder: Path) -> Manifest:
+    """The manifest of a folder; an empty one where there is none, or a damaged one."""
     with suppress(ShardError):
-        manifest = read_manifest(folder / MANIFEST)
-        return manifest.entries(run) if manifest else {}
-    return {}
+        return read_manifest(folder / MANIFEST) or Manifest()
+    return Manifest()
 
 
 def _by_folder(parts: Sequence[Part]) -> dict[Path, list[Part]]:

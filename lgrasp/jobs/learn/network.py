@@ -1,11 +1,11 @@
 """What the jobs that train a network on shards and keep it in one file share."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import PrivateAttr
 
 from lgrasp.dataset.gather import gather
 from lgrasp.engine.cache import content_key
@@ -50,14 +50,13 @@ class NetworkJob(FitRequest, FileJob):
     steps: ClassVar[tuple[str, ...]] = ("steps",)
     """The parameters that are its numbers of steps."""
 
-    _key: str | None = PrivateAttr(None)
+    @cached_property
+    def _rows(self) -> list[str]:
+        return [shard.value for shard in gather(self.shards, rows_digest)]
 
     def key(self) -> str:
-        if self._key is None:
-            rows = [shard.value for shard in gather(self.shards, rows_digest)]
-            described = self.params.model_dump(mode="json")
-            self._key = content_key(*self.kind, rows=rows, params=described, hand=self.hand)
-        return self._key
+        described = self.params.model_dump(mode="json")
+        return content_key(*self.kind, rows=self._rows, params=described, hand=self.hand)
 
     def parts(self) -> list[Part]:
         return [Part(0, self.out, sum(getattr(self.params, name) for name in self.steps))]

@@ -177,21 +177,14 @@ def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Event
 
 def _generated(config: SceneRequest, cache: Cache, events: Events) -> list[Path]:
     """Shards of every object, made where they are missing."""
-    hand, shards = config.hand or "allegro", []
+    pipeline, hand, shards = load_pipeline(config.pipeline).with_seed(config.seed), config.hand or "allegro", []
+    how: dict[str, Any] = config.model_dump(include={"scale", "device", "workers"})
+    how |= {"rows": config.stock, "pipeline": pipeline}
     for name in config.objects:  # before any grasps are generated
         load_mesh(find_object(name), scale=config.scale)
     for name in config.objects:
-        job = GenerateJob(
-            hand=hand,
-            object=name,
-            rows=config.stock,
-            pipeline=load_pipeline(config.pipeline).with_seed(config.seed),
-            out=config.out / "grasps" / f"{hand_source(hand).name}-{find_object(name).stem}",
-            scale=config.scale,
-            device=config.device,
-            workers=config.workers,
-            cache=cache,
-        )
+        out = config.out / "grasps" / f"{hand_source(hand).name}-{find_object(name).stem}"
+        job = GenerateJob(hand=hand, object=name, out=out, cache=cache, **how)
         shards += run(job, _OfObject(events, Path(name).stem)).paths
     return shards
 
