@@ -3,7 +3,7 @@ what its plans are worth on the true meshes of objects, from clouds of them."""
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -149,7 +149,7 @@ def evaluate(
     source, hand = hand_of_shard(cache, first.hand, first.config, found)
     check_network_hand(path, networks.hand, networks.hand_sha256, hand.name, hand.sha256, words=SHARDS)
     touching, palmar = palmar_side(cache, source, hand, found)
-    bench = _Bench(networks, source, upload_hand(touching, found.alias), palmar, starts)
+    bench = _Bench(networks, source, upload_hand(touching, found.alias), palmar, starts, cloud_params(PlanParams()))
     begin = time.perf_counter()
     kinds: dict[str, Any] = {kind: {} for kind in KINDS}
     for number, (_, part) in enumerate(sorted(parts.items())):
@@ -163,14 +163,16 @@ def evaluate(
     return {"hand": hand.name, "kinds": kinds, "seconds": time.perf_counter() - begin}
 
 
+@dataclass(frozen=True)
 class _Bench:
     """A predictor, and what it is measured with."""
 
-    def __init__(
-        self, networks: Networks, source: HandSource, hand: HandArrays, palmar: ContactSurface, starts: int
-    ) -> None:
-        self.networks, self.source, self.hand, self.palmar, self.starts = networks, source, hand, palmar, starts
-        self.params = cloud_params(PlanParams())
+    networks: Networks
+    source: HandSource
+    hand: HandArrays
+    palmar: ContactSurface
+    starts: int
+    params: PlanParams
 
     def plans(self, model: ObjectModel, kind: str, rng: np.random.Generator, number: int) -> GraspTable:
         """Plans from a new cloud of a mesh as rows of it: checked there, with the control poses that were planned."""

@@ -67,17 +67,9 @@ class PlanJob(PlanRequest, Job):
         record = self._record()
         normals = None if record.normals is None else np.asarray(record.normals, np.float32).tobytes().hex()
         rest = None if around is None else np.asarray(around.contact_points, np.float32).tobytes().hex()
-        return content_key(
-            "plan",
-            VERSION,
-            hand=hand.sha256,
-            object=[model.name, mesh_hash(record), normals, rest],
-            starts=self.starts,
-            stand_off=self._stand_off(),
-            params=self._params().model_dump(mode="json"),
-            keep_invalid=self.keep_invalid,
-            **self._model_key(),
-        )
+        told = self._told() | {"params": self._params().model_dump(mode="json"), "keep_invalid": self.keep_invalid}
+        seen = [model.name, mesh_hash(record), normals, rest]
+        return content_key("plan", VERSION, hand=hand.sha256, object=seen, **told)
 
     def parts(self) -> list[Part]:
         source, _, model, _ = self._models
@@ -103,20 +95,13 @@ class PlanJob(PlanRequest, Job):
             self.starts, lambda done, plans: progress(done, f"{plans:,} plans"), keep_invalid=self.keep_invalid
         )
         seconds = time.perf_counter() - begin
-        header = ShardHeader(
-            pipeline="plan",
-            seed=0,
-            shard_index=0,
-            config={
-                "run_key": self.key(),
-                "bounds": planner.effort.bounds.describe(),
-                "plan": self._params().model_dump(mode="json"),
-                "starts": self.starts,
-                "stand_off": self._stand_off(),
-                **hand_config(source),
-                **self._model_key(),
-            },
-        )
+        config = {
+            "run_key": self.key(),
+            "bounds": planner.effort.bounds.describe(),
+            "plan": plan.model_dump(mode="json"),
+        }
+        config |= self._told() | hand_config(source)
+        header = ShardHeader(pipeline="plan", seed=0, shard_index=0, config=config)
         statistics = {
             "device": self.device_used.name,
             "seconds_wall": seconds,
@@ -143,8 +128,10 @@ class PlanJob(PlanRequest, Job):
         check_network_hand(path, found.hand, found.hand_sha256, source.name, hand.sha256)
         return found
 
-    def _model_key(self) -> dict[str, Any]:
-        return {"network": network_key(find_network(str(self.model)))} if self.networks else {}
+    def _told(self) -> dict[str, Any]:
+        """What keys and shards tell of the starts."""
+        told = {"starts": self.starts, "stand_off": self._stand_off()}
+        return told | ({"network": network_key(find_network(str(self.model)))} if self.networks else {})
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``starts``, ``points`` (the object is a cloud), ``counts`` (what became of the starts), medians
