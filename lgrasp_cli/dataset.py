@@ -26,9 +26,6 @@ def info(paths: Shards) -> Answer:
 
     Example: lgrasp dataset info grasps
     """
-    from lgrasp.dataset.files import shards_below
-
-    shards_below(paths)
     from lgrasp.dataset.info import describe
 
     shards = describe(paths)
@@ -49,9 +46,6 @@ def check(paths: Shards) -> Answer:
 
     Example: lgrasp dataset check grasps
     """
-    from lgrasp.dataset.files import shards_below
-
-    shards_below(paths)
     from lgrasp.dataset.manifest import check_files
     from lgrasp.dataset.validate import validate_shard
 
@@ -149,10 +143,8 @@ def report(
 
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
-    from lgrasp.dataset.files import shards_below
     from lgrasp.files import check_file
 
-    shards_below(paths)
     check_file(out)
     from lgrasp.dataset.report.write import report_dataset
     from lgrasp_cli.progress import Bar

@@ -116,11 +116,9 @@ def evaluate(
 
     Example: lgrasp learn eval grasp.pt grasps --out plans
     """
-    from lgrasp.dataset.files import shards_below
     from lgrasp.errors import ConfigError
     from lgrasp.learn.networks import find_network, read_card
 
-    shards_below(shards)
     path, cache = find_network(predictor), open_cache(cache_dir)
     if (kind := read_card(path)["kind"]) == "grasp":
         from lgrasp.jobs.learn.grasp import evaluate as measure_plans

@@ -16,11 +16,24 @@ if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.engine.pipeline import Pipeline
 
+
+def _there(context: typer.Context, value: Any) -> Any:
+    """Shards are looked for before anything heavy is imported."""
+    if value and not context.resilient_parsing:
+        from lgrasp.dataset.files import shards_below
+
+        shards_below(value)
+    return value
+
+
 Hand = Annotated[str, Option(help="Name of a hand, a URDF file, or a folder with hand.yaml.", **HAND)]
 HandArgument = Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.", **HAND)]
 Mesh = Annotated[str, Option("--object", "-o", help="Mesh file, or the name of an object.", **OBJECT)]
 MeshArgument = Annotated[str, Argument(help="Mesh file, or the name of an object.", **OBJECT)]
-Shards = Annotated[list[Path], Argument(metavar="SHARDS", help="Shard files, or folders; subfolders are searched.")]
+Shards = Annotated[
+    list[Path],
+    Argument(metavar="SHARDS", help="Shard files, or folders; subfolders are searched.", callback=_there),
+]
 PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.", **PIPELINE)]
 Seed = Annotated[int | None, Option(help="Base seed; default: the pipeline's.")]
 Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]

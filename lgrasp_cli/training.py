@@ -31,11 +31,9 @@ def split_rows(
 
     Example: lgrasp dataset split grasps --by object -o split.json
     """
-    from lgrasp.dataset.files import shards_below
     from lgrasp.files import check_file
 
     parts = _shares(shares)
-    shards_below(paths)
     check_file(out)
     from lgrasp.dataset.split import make_split
 
@@ -61,10 +59,8 @@ def normalisation(
 
     Example: lgrasp dataset normalisation grasps --split split.json -o normalisation.json
     """
-    from lgrasp.dataset.files import shards_below
     from lgrasp.files import check_file
 
-    shards_below(paths)
     check_file(out)
     from lgrasp.dataset.normalisation import Normalisation
 
