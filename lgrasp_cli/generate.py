@@ -192,12 +192,8 @@ def _resting(poses: list[dict[str, Any]]) -> list[tuple[str, str]]:
         return []
     without = [(k, p["probability"]) for k, p in enumerate(poses) if not p["rows"]]
     likely = ", ".join(f"{k} ({100 * share:.0f} %)" for k, share in without if share >= _LIKELY)
-    return [
-        (
-            "resting poses",
-            f"{len(poses) - len(without)} of {len(poses)} have grasps" + (f"; none: {likely}" if likely else ""),
-        )
-    ]
+    none = f"; none: {likely}" if likely else ""
+    return [("resting poses", f"{len(poses) - len(without)} of {len(poses)} have grasps{none}")]
 
 
 def _profile(data: dict[str, Any]) -> list[Block]:

@@ -149,11 +149,8 @@ def _explain(error: BaseException) -> tuple[str, int]:
 
 def _extra_word(error: typer.TyperException) -> str:
     """How to give an option several values, for a word too many after one."""
-    found, context = (
-        re.search(r"unexpected extra argument\S* \((\S+)", error.format_message()),
-        getattr(error, "ctx", None),
-    )
-    words = sys.argv[1:]
+    found = re.search(r"unexpected extra argument\S* \((\S+)", error.format_message())
+    context, words = getattr(error, "ctx", None), sys.argv[1:]
     if not found or not context or found[1].rstrip(")") not in words[2:]:
         return ""
     extra = found[1].rstrip(")")

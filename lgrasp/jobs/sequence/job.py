@@ -64,17 +64,8 @@ class SequenceJob(SequenceRequest, SearchJob):
         return found.tried >= most_rounds(self.pipeline, rows)
 
     def load_inputs(self, events: Events) -> SequenceInputs:
-        pipeline = self.pipeline
-        inputs = load_sequence_inputs(
-            self.cache,
-            self.keys,
-            pipeline.object,
-            pipeline.field,
-            self.device_used,
-            events.loading,
-            self.clouds_by_key(),
-        )
-        return self.with_sampler(inputs)
+        what = self.keys, self.pipeline.object, self.pipeline.field, self.device_used, events.loading
+        return self.with_sampler(load_sequence_inputs(self.cache, *what, self.clouds_by_key()))
 
     def clouds_by_key(self) -> dict[str, Callable[[], ObjectModel]]:
         """What makes the objects that are point clouds."""
