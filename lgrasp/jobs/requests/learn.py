@@ -26,7 +26,7 @@ class PolicyRequest(Request):
     scale: MeshScale = 1.0
     pipeline: NamedPipeline = Field(default_factory=lambda: load_pipeline("robust"))
     out: Path = Field(Path("policy.npz"), description="File of the policy.")
-    params: PosePolicyParams = Field(default_factory=lambda: PosePolicyParams.model_validate({}))
+    params: PosePolicyParams = Field(default_factory=PosePolicyParams)
 
     def check(self) -> None:
         if self.out.is_dir():

@@ -34,7 +34,7 @@ class SceneRequest(Request):
     seed: Seed = 0
     out: Path = Field(Path("scenes"), description="Folder of the scenes.")
     workers: int = Field(0, ge=0, description="Scenes made at once; 0: one a core.")
-    scene: SceneParams = Field(default_factory=lambda: SceneParams.model_validate({}))
+    scene: SceneParams = Field(default_factory=SceneParams)
 
     @property
     def known_parts(self) -> int:

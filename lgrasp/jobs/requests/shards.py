@@ -170,7 +170,7 @@ class FitRequest(Request):
 
     shards: ShardPaths
     out: Path = Field(Path("coarse.pt"), description="File of the predictor.")
-    params: LearnParams = Field(default_factory=lambda: LearnParams.model_validate({}))
+    params: LearnParams = Field(default_factory=LearnParams)
     hand: str | None = Field(None, description="Default: that of the shards.")
 
     def check(self) -> None:
@@ -189,7 +189,7 @@ class DiffuserRequest(FitRequest):
     maker: ClassVar[str] = "lgrasp.jobs.learn.diffuser:DiffuserJob"
 
     out: Path = Field(Path("diffuser.pt"), description="File of the network.")
-    params: DiffuserParams = Field(default_factory=lambda: DiffuserParams.model_validate({}))
+    params: DiffuserParams = Field(default_factory=DiffuserParams)
 
 
 class GraspRequest(FitRequest):
@@ -198,7 +198,7 @@ class GraspRequest(FitRequest):
     maker: ClassVar[str] = "lgrasp.jobs.learn.grasp:GraspJob"
 
     out: Path = Field(Path("grasp.pt"), description="File of the networks.")
-    params: GraspParams = Field(default_factory=lambda: GraspParams.model_validate({}))
+    params: GraspParams = Field(default_factory=GraspParams)
 
 
 class ExportRequest(Request):
