@@ -10,6 +10,7 @@ import trimesh
 from support.jaws import mesh_record
 
 from lgrasp.cloud.read import Cloud
+from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
@@ -42,7 +43,7 @@ def plan(cache_root: Path) -> Callable[..., JobOutcome]:
             "device": "cpu",
             "cache": Cache(cache_root, pytest.fail),
         }
-        return run(PlanJob(**job | changes))
+        return run(parse_model(PlanJob, job | changes, "plan"))
 
     return plan
 
@@ -161,8 +162,8 @@ def test_bad_jobs(plan, tmp_path):
     for changes, words in (
         ({}, "one of the two"),
         ({"object": "mug", "cloud": cloud}, "one of the two"),
-        ({"object": "mug", "starts": 0}, "--starts 0"),
-        ({"object": "mug", "stand_off": np.nan}, "--stand-off nan"),
+        ({"object": "mug", "starts": 0}, "'starts' = 0"),
+        ({"object": "mug", "stand_off": np.nan}, "'stand_off' = nan"),
     ):
         with pytest.raises(ConfigError, match=words):
             plan(tmp_path / "out", **changes)
