@@ -22,6 +22,7 @@ from lgrasp_cli.options import (
     choose_pipeline,
     given,
     open_cache,
+    set_option,
     split,
     warn,
 )
@@ -126,7 +127,6 @@ def table1(
     how = given(settings=settings, seed=seed, device=device, workers=workers)
     config = parse_model(JobConfig, load_config("table1").model_dump() | what | how, "bench table1")
     file = _written(json_path, resume)
-    check_report(json_path)
     _check(config)
     cache = open_cache(None)
     from lgrasp.bench.charts import draw_table
@@ -195,7 +195,6 @@ def bench_sequence(
     Example: lgrasp bench sequence --sequences 2 --methods field
     """
     file = _written(json_path, resume)
-    check_report(json_path)
     from lgrasp.config import parse_model
     from lgrasp.jobs.requests.search import SampleRequest, SequenceRequest
     from lgrasp.jobs.sets import SequenceSets, object_sequences
@@ -239,11 +238,7 @@ def bench_refine(
     noise: Annotated[bool, Option("--noise/--no-noise", help="Also measure table IV: clouds with noise.")] = True,
     settings: Annotated[
         list[str] | None,
-        Option(
-            "--set",
-            metavar="PART.KEY=VALUE",
-            help="Set a parameter of the plans, such as bounds.friction=0.8 or plan.finalists=5; repeatable.",
-        ),
+        set_option(help="Set a parameter of the plans, such as bounds.friction=0.8 or plan.finalists=5; repeatable."),
     ] = None,
     device: Device = "auto",
     json_path: JsonPath = None,
@@ -269,14 +264,9 @@ def bench_refine(
     cache = open_cache(cache_dir)
     from lgrasp.bench.refine import NOISES, bench_hands, refine_page
 
-    how: dict[str, Any] = {
-        "engine": engine,
-        "params": params,
-        "noises": NOISES if noise else (),
-        "device": device,
-        "cache": cache,
-    }
-    result = bench_hands(split(hands), split(objects), starts, simulate, progress=say, **how)
+    how: dict[str, Any] = {"engine": engine, "params": params, "noises": NOISES if noise else ()}
+    how |= {"device": device, "cache": cache, "progress": say}
+    result = bench_hands(split(hands), split(objects), starts, simulate, **how)
     result["set"] = settings or []
     _print(result, json_path, refine_page(result))
 
@@ -299,30 +289,32 @@ def bench_soak(
 
     Example: lgrasp bench soak --hours 2 --json soak.json
     """
-    check_report(json_path)
+    file = _written(json_path)
     from lgrasp.bench.soak.report import run_soak, soak_page
     from lgrasp.engine.report import write_json
 
     chosen = [split(names) if names else () for names in (commands, signals)]
     result: dict[str, Any] = {}
     for result in run_soak(*chosen, rounds=rounds, hours=hours, seed=seed, **({} if quiet else {"say": say})):
-        if json_path not in (None, "-"):
-            write_json(json_path, result)
+        if file:
+            write_json(file, result)
     _print(result, json_path, soak_page(result))
     if result["faults"]:
         raise typer.Exit(1)
 
 
-def _written(json_path: str | None, resume: bool) -> str | None:
+def _written(json_path: str | None, resume: bool = False) -> str | None:
     """The file that is written as the benchmark goes on.
 
     Raises:
         ConfigError: there is none to resume from.
+        OutputError: it could not be written.
     """
     if resume and json_path in (None, "-"):
         from lgrasp.errors import ConfigError
 
         raise ConfigError("--resume needs the file to continue: --json PATH")
+    check_report(json_path)
     return None if json_path == "-" else json_path
 
 
@@ -360,15 +352,13 @@ def _refuse_options(context: typer.Context) -> None:
 def _measure(table: "Comparison", config: "JobConfig", cache: "Cache", file: str | None = None) -> "Comparison":
     """The table with all its cells; written to the file after each."""
     from lgrasp.bench.comparison import cell_line, measure_table
-    from lgrasp.bench.rate import Bench
     from lgrasp.engine.report import write_json
 
-    with Bench() as runs:
-        measured = measure_table(runs, table, config, cache, progress=say)
-        for table, cell in measured:
-            if file:
-                write_json(file, table)
-            say(cell_line(table, cell))
+    for latest, cell in measure_table(table, config, cache, progress=say):
+        table = latest
+        if file:
+            write_json(file, table)
+        say(cell_line(table, cell))
     return table
 
 

@@ -11,7 +11,7 @@ from typer import Argument, Option
 from lgrasp.choices import FormatName, MetricName
 from lgrasp.words import number, plural
 from lgrasp_cli.names import one_of
-from lgrasp_cli.options import Quiet, Shards, Where, old_name, split, warn
+from lgrasp_cli.options import Quiet, Shards, Where, old_name, set_option, split, warn
 from lgrasp_cli.tables import Answer, Block, TextTable, checked, following, place, reporting, took
 from lgrasp_cli.training import normalisation, split_rows
 from lgrasp_cli.working import How, working
@@ -26,9 +26,6 @@ def info(paths: Shards) -> Answer:
 
     Example: lgrasp dataset info grasps
     """
-    from lgrasp.dataset.files import shards_below
-
-    shards_below(paths)
     from lgrasp.dataset.info import describe
 
     shards = describe(paths)
@@ -49,9 +46,6 @@ def check(paths: Shards) -> Answer:
 
     Example: lgrasp dataset check grasps
     """
-    from lgrasp.dataset.files import shards_below
-
-    shards_below(paths)
     from lgrasp.dataset.manifest import check_files
     from lgrasp.dataset.validate import validate_shard
 
@@ -95,12 +89,7 @@ def metrics(
     add: Annotated[str, Option(help=f"Metrics, separated by commas: {', '.join(get_args(MetricName))}.")],
     out: Annotated[Path, Option("--out", "-o", help="Folder of the new shards.")],
     settings: Annotated[
-        list[str] | None,
-        Option(
-            "--set",
-            metavar="PART.KEY=VALUE",
-            help="Measure with another value, such as bounds.friction=0.8 or hold.draws=16.",
-        ),
+        list[str] | None, set_option(help="Measure with another value, such as bounds.friction=0.8 or hold.draws=16.")
     ] = None,
 ) -> None:
     """Copy shards and add quality metrics to the copies; existing copies are kept.
@@ -154,10 +143,8 @@ def report(
 
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
-    from lgrasp.dataset.files import shards_below
     from lgrasp.files import check_file
 
-    shards_below(paths)
     check_file(out)
     from lgrasp.dataset.report.write import report_dataset
     from lgrasp_cli.progress import Bar
@@ -238,12 +225,7 @@ def _made_by(shard: dict[str, Any]) -> str:
 def _metric_table(shards: list[dict[str, Any]]) -> TextTable:
     ends = ("min", "mean", "max")
     rows = [
-        (
-            "" if line else name,
-            metric,
-            values["unit"].partition(":")[0],
-            *(number(values[k], ".4g") for k in ends),
-        )
+        ("" if line else name, metric, values["unit"].partition(":")[0], *(number(values[k], ".4g") for k in ends))
         for name, s in zip(_places(shards), shards, strict=True)
         for line, (metric, values) in enumerate(s["metrics"].items())
     ]
@@ -268,8 +250,7 @@ def export(
         bool, Option("--only-holding", help="Only grasps that held in simulation; same as --where physics/fc_holds.")
     ] = False,
     split_file: Annotated[
-        Path | None,
-        Option("--split", help="File written by dataset split; each part gets its own files (webdataset)."),
+        Path | None, Option("--split", help="File written by dataset split; each part gets its own files (webdataset).")
     ] = None,
     licence: Annotated[
         str, Option(metavar="SPDX", help="Add a card with this licence, provenance and checksums.")

@@ -1,20 +1,69 @@
 """``lgrasp generate``: the main job."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Option
 
-from lgrasp.choices import ScoreName
+from lgrasp.choices import PalmUse, ScoreName, ThumbPlace
 from lgrasp.words import plural
 from lgrasp_cli.many import run_all, show_plans
-from lgrasp_cli.names import HANDS, OBJECTS, one_of
+from lgrasp_cli.names import GRASP_TYPE, HANDS, OBJECTS, one_of
 from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, Simulate, choose_pipeline, given
-from lgrasp_cli.steer import Above, Approach, Avoid, Fingers, GraspType, Links, Palm, PoseFile, Thumb, Touch
 from lgrasp_cli.tables import Block, closed, counted, following, held, place, took
 from lgrasp_cli.working import How, working
 
 _LIKELY = 0.05  # probability of a resting pose that is named when it has no grasps
+
+_steers = partial(Option, rich_help_panel="Steer")
+
+GraspType = Annotated[
+    str | None, _steers(help="Grasp type, such as tripod; lgrasp hands show lists a hand's.", **GRASP_TYPE)
+]
+Fingers = Annotated[
+    str | None, _steers(metavar="NAMES", help="Fingers that must all touch, and no others, such as thumb,index.")
+]
+Links = Annotated[
+    str | None,
+    _steers(
+        metavar="NAMES", help="The only links that may touch; LINK:radial, LINK:ulnar or LINK:tip: only with that side."
+    ),
+]
+Palm = Annotated[str | None, _steers(**one_of(PalmUse, "PALM", "Whether the palm may or must touch."))]
+Thumb = Annotated[
+    str | None, _steers(**one_of(ThumbPlace, "PLACE", "Where the thumb is: across the palm or along it."))
+]
+Approach = Annotated[
+    str | None,
+    _steers(
+        metavar="X,Y,Z:DEG",
+        help="Directions that the palm may face, a cone in the object's frame; 0,0,-1:30 is from above.",
+    ),
+]
+Above = Annotated[
+    str | None,
+    _steers(
+        metavar="X,Y,Z,D", help="Keep the hand and its approach where X x + Y y + Z z >= D (object's frame, metres)."
+    ),
+]
+PoseFile = Annotated[
+    Path | None,
+    _steers(
+        "--pose",
+        metavar="FILE",
+        help="Object poses in the hand's frame (npz, csv or a shard); only fingers are searched.",
+    ),
+]
+Touch = Annotated[
+    list[str] | None,
+    _steers(
+        metavar="REGION",
+        help="Region that must contain all contacts (with :0.7 appended, 70 % of the force): box:x0,y0,z0:x1,y1,z1, "
+        "sphere:x,y,z:r, group:NAME, color:#rrggbb, a closed mesh, an .npz of weights per vertex; repeatable.",
+    ),
+]
+Avoid = Annotated[list[str] | None, _steers(metavar="REGION", help="Region without contacts; repeatable.")]
 
 
 @working
@@ -79,8 +128,7 @@ def generate(
     avoid: Avoid = None,
     table: Annotated[bool, Option("--table", help="Leave room for the table that the object rests on.")] = False,
     negatives: Annotated[
-        float,
-        Option(min=0, max=100, metavar="SHARE", help="Failed rows to keep per grasp, with metric 'valid' 0."),
+        float, Option(min=0, max=100, metavar="SHARE", help="Failed rows to keep per grasp, with metric 'valid' 0.")
     ] = 0.0,
     dry_run: DryRun = False,
 ) -> None:
@@ -95,8 +143,8 @@ def generate(
     from lgrasp.jobs.config import pair_requests
     from lgrasp.object.find import all_objects
 
-    chosen = choose_pipeline(pipeline, seed, contacts, settings).with_passes(passes)
-    chosen = chosen.with_params("search", score=score) if score else chosen
+    chosen = choose_pipeline(pipeline, seed, contacts, settings)
+    chosen = chosen.with_params("search", **given(passes=passes, score=score))
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     chosen = chosen.with_table() if table else chosen
     chosen = chosen.with_steering(
@@ -144,12 +192,8 @@ def _resting(poses: list[dict[str, Any]]) -> list[tuple[str, str]]:
         return []
     without = [(k, p["probability"]) for k, p in enumerate(poses) if not p["rows"]]
     likely = ", ".join(f"{k} ({100 * share:.0f} %)" for k, share in without if share >= _LIKELY)
-    return [
-        (
-            "resting poses",
-            f"{len(poses) - len(without)} of {len(poses)} have grasps" + (f"; none: {likely}" if likely else ""),
-        )
-    ]
+    none = f"; none: {likely}" if likely else ""
+    return [("resting poses", f"{len(poses) - len(without)} of {len(poses)} have grasps{none}")]
 
 
 def _profile(data: dict[str, Any]) -> list[Block]:

@@ -110,8 +110,7 @@ def add_hand(
         str | None, Option(metavar="LINK", help="Take only the hand that this link (or body) of a whole robot carries.")
     ] = None,
     mesh_dir: Annotated[
-        list[Path] | None,
-        Option(exists=True, file_okay=False, help="Further folder of meshes; repeatable."),
+        list[Path] | None, Option(exists=True, file_okay=False, help="Further folder of meshes; repeatable.")
     ] = None,
 ) -> None:
     """Draft a hand from its URDF or MJCF: fingers, palmar surface, canonical box, open posture.

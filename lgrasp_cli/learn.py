@@ -29,8 +29,7 @@ def fit(
         Option("--out", "-o", help="File of the network; default: coarse.pt, diffuser.pt, grasp.pt or policy.npz."),
     ] = None,
     steps: Annotated[
-        int | None,
-        Option(help="Training steps; default: 1500 (coarse) or 20000; grasp: after grasp.completion_steps."),
+        int | None, Option(help="Training steps; default: 1500 (coarse) or 20000; grasp: after grasp.completion_steps.")
     ] = None,
     joint_steps: Annotated[
         int | None, Option(help="Training steps through the refiner afterwards (coarse); default: 80.")
@@ -45,12 +44,10 @@ def fit(
     ] = None,
     hand: Annotated[str | None, Option(help="Hand of a pose policy; default: allegro.", **HAND)] = None,
     objects: Annotated[
-        list[str] | None,
-        Option("--object", help="Objects of a pose policy; default: random shapes.", **OBJECT),
+        list[str] | None, Option("--object", help="Objects of a pose policy; default: random shapes.", **OBJECT)
     ] = None,
     pipeline: Annotated[
-        str | None,
-        Option("--pipeline", "-p", help="Pipeline of a pose policy; default: robust.", **PIPELINE),
+        str | None, Option("--pipeline", "-p", help="Pipeline of a pose policy; default: robust.", **PIPELINE)
     ] = None,
     seed: Annotated[int, Option(help="Seed of examples, weights and batches.")] = 0,
 ) -> None:
@@ -67,17 +64,15 @@ def fit(
     from lgrasp.errors import ConfigError
     from lgrasp.jobs.requests.learn import PolicyRequest
     from lgrasp.jobs.requests.shards import DiffuserRequest, FitRequest, GraspRequest
-    from lgrasp.learn.diffuser.params import DiffuserParams
-    from lgrasp.learn.grasp.params import GraspParams
-    from lgrasp.learn.params import LearnParams, PosePolicyParams
 
     kinds: dict[str, Any] = {
-        "coarse": (FitRequest, LearnParams, _show_fit),
-        "diffuser": (DiffuserRequest, DiffuserParams, _show_steps),
-        "grasp": (GraspRequest, GraspParams, _show_grasps),
-        "pose": (PolicyRequest, PosePolicyParams, _show_policy),
+        "coarse": (FitRequest, _show_fit),
+        "diffuser": (DiffuserRequest, _show_steps),
+        "grasp": (GraspRequest, _show_grasps),
+        "pose": (PolicyRequest, _show_policy),
     }
-    request, kind, show = kinds[model]
+    all_params: dict[str, Any] = {name: taken.model_fields["params"].annotation for name, (taken, _) in kinds.items()}
+    (request, show), kind = kinds[model], all_params[model]
     asked: dict[str, Any] = given(hand=hand, objects=objects or None, pipeline=pipeline)
     if model == "pose" and shards:
         raise ConfigError(f"learn fit: {shards[0]}: a pose policy takes no shards, but --hand and --object")
@@ -91,7 +86,7 @@ def fit(
         asked["pipeline"] = choose_pipeline(pipeline)
     chosen = given(steps=steps, joint_steps=joint_steps, unrolled=unrolled, batch=batch, seed=seed)
     for name in chosen.keys() - kind.model_fields:
-        takers = ", ".join(other for other, (_, params, _) in kinds.items() if name in params.model_fields)
+        takers = ", ".join(other for other, params in all_params.items() if name in params.model_fields)
         raise ConfigError(
             f"learn fit: --{name.replace('_', '-')} is for --model {takers}; "
             f"--set {model}.KEY=VALUE takes {', '.join(kind.model_fields)}"
@@ -121,14 +116,12 @@ def evaluate(
 
     Example: lgrasp learn eval grasp.pt grasps --out plans
     """
-    from lgrasp.dataset.files import shards_below
     from lgrasp.errors import ConfigError
     from lgrasp.learn.networks import find_network, read_card
 
-    shards_below(shards)
     path, cache = find_network(predictor), open_cache(cache_dir)
     if (kind := read_card(path)["kind"]) == "grasp":
-        from lgrasp.jobs.learn.grasp_eval import evaluate as measure_plans
+        from lgrasp.jobs.learn.grasp import evaluate as measure_plans
 
         data = measure_plans(path, shards, cache, clouds=clouds, starts=starts, seed=seed, device=device, out=out)
         return Answer(data, [] if quiet else [_plans(data)])
@@ -139,7 +132,7 @@ def evaluate(
 
         data = measure(path, shards, cache, seed=seed, device=device)
         return Answer(data, [] if quiet else [_draws(data)])
-    from lgrasp.jobs.learn.coarse_eval import evaluate as run
+    from lgrasp.jobs.learn.job import evaluate as run
 
     data = run(path, shards, cache, clouds=clouds, seed=seed, device=device)
     return Answer(data, [] if quiet else [_coarse(data)])
@@ -266,9 +259,7 @@ def _learnt_from(report: dict[str, Any]) -> str:
 
 
 def _show_fit(data: dict[str, Any]) -> list[Block]:
-    pairs = [
-        ("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}"),
-    ]
+    pairs = [("hand, objects", f"{data['hand']}; {', '.join(data['objects'])}")]
     words = (
         ("frozen", "trained on poses"),
         ("longer", "on poses as many steps more"),

@@ -46,9 +46,6 @@ def render(
 
     Example: lgrasp render grasps/allegro-mug/robust -n 16 --out grid.png
     """
-    from lgrasp.dataset.files import shards_below
-
-    shards_below(paths)
     from lgrasp.dataset.scenes import SceneRows, draw_motion
     from lgrasp.files import write_file
     from lgrasp.picture.scene import STAGES

@@ -17,14 +17,12 @@ from lgrasp.notices import on_notice
 from lgrasp_cli import bench, cache, catalog, dataset, hands, learn, prepare, scenes
 from lgrasp_cli.generate import generate
 from lgrasp_cli.look import render, view
-from lgrasp_cli.options import old_name, warn
-from lgrasp_cli.plan import plan
-from lgrasp_cli.reach import reach
-from lgrasp_cli.refine import refine
+from lgrasp_cli.many import run
+from lgrasp_cli.options import old_name, options_of, warn
+from lgrasp_cli.plan import plan, refine
 from lgrasp_cli.renamed import renew
-from lgrasp_cli.run import run
 from lgrasp_cli.sequence import sample, sequence
-from lgrasp_cli.simulate import simulate
+from lgrasp_cli.simulate import reach, simulate
 from lgrasp_cli.status import status
 from lgrasp_cli.submit import WORDS, submit
 
@@ -89,21 +87,11 @@ def program() -> Any:
     return typer.main.get_command(app)
 
 
-def options_of(words: Sequence[str]) -> set[str]:
-    """Names of the options of the command that the words of a command line begin with."""
-    command = program()
-    for word in words:
-        if (below := getattr(command, "commands", {}).get(word)) is None:
-            break
-        command = below
-    return {name for parameter in command.params for name in parameter.opts}
-
-
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted, 141 nobody
     reads what it prints."""
     on_notice(warn)
-    sys.argv[1:] = renew(sys.argv[1:], options_of(sys.argv[1:]))
+    sys.argv[1:] = renew(sys.argv[1:], options_of(program(), sys.argv[1:]))
     if os.environ.get("LGRASP_DEBUG"):
         sys.exit(_exit_code())
     try:
@@ -161,11 +149,8 @@ def _explain(error: BaseException) -> tuple[str, int]:
 
 def _extra_word(error: typer.TyperException) -> str:
     """How to give an option several values, for a word too many after one."""
-    found, context = (
-        re.search(r"unexpected extra argument\S* \((\S+)", error.format_message()),
-        getattr(error, "ctx", None),
-    )
-    words = sys.argv[1:]
+    found = re.search(r"unexpected extra argument\S* \((\S+)", error.format_message())
+    context, words = getattr(error, "ctx", None), sys.argv[1:]
     if not found or not context or found[1].rstrip(")") not in words[2:]:
         return ""
     extra = found[1].rstrip(")")

@@ -1,12 +1,18 @@
-"""Several jobs one after another: their progress, their plans, and one report of all."""
+"""Several jobs one after another: ``lgrasp run``, their progress, their plans, and one report of all."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
+from lgrasp.words import number
+from lgrasp_cli.names import CONFIG, OBJECTS
+from lgrasp_cli.options import DryRun, given
 from lgrasp_cli.tables import TextTable, print_report
-from lgrasp_cli.working import How, conclude, merely_checked, run_job
+from lgrasp_cli.working import How, conclude, merely_checked, run_job, working
 
 if TYPE_CHECKING:
     from lgrasp.engine.request import Request
@@ -76,14 +82,35 @@ def _run_one(request: "Request", how: How) -> dict[str, Any]:
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:
-    if "asked" not in result:
-        return (result["title"], result["unit"], "-", "-", "-", "-", result["status"])
-    return (
-        result["title"],
-        result["unit"],
-        f"{result['asked']:,}",
-        f"{result['made'] + result['present']:,}",
-        f"{result['seconds']['total']:.1f}",
-        f"{result['strict_valid_per_s']:,.0f}" if "strict_valid_per_s" in result else "-",
-        result["status"],
-    )
+    numbers = ["-"] * 4
+    if "asked" in result:
+        numbers[:2] = f"{result['asked']:,}", f"{result['made'] + result['present']:,}"
+        numbers[2:] = f"{result['seconds']['total']:.1f}", number(result.get("strict_valid_per_s"))
+    return (result["title"], result["unit"], *numbers, result["status"])
+
+
+@working
+def run(
+    config: Annotated[str, Argument(help="Config file, or the name of a config.", **CONFIG)],
+    how: How,
+    rows: Annotated[int | None, Option("-n", "--rows", help="Replaces rows.")] = None,
+    out: Annotated[Path | None, Option(help="Replaces out.")] = None,
+    object_dir: Annotated[Path | None, Option(help="Replaces object_dir.")] = None,
+    objects: Annotated[list[str] | None, Option("--object", help="Replaces objects; repeatable.", **OBJECTS)] = None,
+    held_out: Annotated[list[str] | None, Option(help="Replaces held_out; repeatable.", **OBJECTS)] = None,
+    seed: Annotated[int | None, Option(help="Replaces seed.")] = None,
+    dry_run: DryRun = False,
+) -> None:
+    """Run the job of a config, or one job for every hand, object and pipeline that it names.
+
+    Key 'job' names a command, and the other keys are its options; without it, grasps are generated. A job that fails
+    does not stop the others; the exit code is the worst one. Tasks of an array share the files of all jobs.
+
+    Example: lgrasp run configs/smoke.yaml
+    """
+    from lgrasp.jobs.config import load_requests
+
+    changes = given(rows=rows, out=out, object_dir=object_dir, seed=seed, device=how.device, workers=how.workers)
+    changes |= {key: value for key, value in (("objects", objects), ("held_out", held_out)) if value}
+    asked = load_requests(config, changes)
+    run_all(asked.requests, replace(how, devices=how.devices or asked.devices), dry_run=dry_run)

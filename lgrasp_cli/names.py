@@ -9,24 +9,42 @@ import typer
 _SHOWN = 24  # characters of names in the column that help has for values
 
 
-def named(metavar: str, known: Callable[[], Iterable[str]], read: Callable[[str, str], str]) -> dict[str, Any]:
+def named(
+    metavar: str, known: Callable[[], Iterable[str]] | str, read: Callable[[str, str], str] | str = ""
+) -> dict[str, Any]:
     """Arguments of an option or argument whose values are names.
 
     Args:
-        known: names that the shell completes.
-        read: called with (name, option); gives the name to go on with, raises LgraspError where it cannot be.
+        known: names that the shell completes; ``module:function`` is imported then.
+        read: called with (name, option); gives the name to go on with, raises LgraspError where it cannot be. Or
+            ``module:function``, which raises where there is none of a name; none: the command reads them itself, before
+            it imports anything heavy.
     """
+
+    def one(name: str, flag: str) -> str:
+        if not isinstance(read, str):
+            return read(name, flag)
+        if read:
+            _function(read)(name)
+        return name
 
     def callback(context: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
         if value is None or context.resilient_parsing:  # the shell completes
             return value
         flag = param.opts[0]
-        return [read(name, flag) for name in value] if isinstance(value, list | tuple) else read(value, flag)
+        return [one(name, flag) for name in value] if isinstance(value, list | tuple) else one(value, flag)
 
     def complete(incomplete: str) -> list[str]:
-        return [name for name in known() if name.startswith(incomplete)]
+        names = _function(known)() if isinstance(known, str) else known()
+        return [name for name in names if name.startswith(incomplete)]
 
     return {"metavar": metavar, "callback": callback, "autocompletion": complete}
+
+
+def _function(place: str) -> Callable[..., Any]:
+    """What ``module:function`` stands for; the module is imported now."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
 
 
 def one_of(choice: Any, kind: str, what: str) -> dict[str, Any]:
@@ -53,26 +71,6 @@ def one_of(choice: Any, kind: str, what: str) -> dict[str, Any]:
     return named(shown, lambda: names, read) | {"help": what}
 
 
-def _call(place: str, *values: str) -> Any:
-    """What ``module:function`` gives; the module is imported now."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)(*values)
-
-
-def _listed_by(place: str) -> Callable[[], Iterable[str]]:
-    return lambda: _call(place)
-
-
-def _found_by(place: str) -> Callable[[str, str], str]:
-    """Leaves names as they are; ``module:function`` raises where there is none of that name."""
-
-    def read(name: str, flag: str) -> str:
-        _call(place, name)
-        return name
-
-    return read
-
-
 def _hands() -> Iterable[str]:
     from lgrasp.hand.names import PACKAGE_HANDS, known_hands
 
@@ -93,24 +91,15 @@ def _devices(names: str, flag: str) -> str:
     return names if names == "all" else ",".join(_device(name, flag) for name in names.split(","))
 
 
-def _as_given(name: str, flag: str) -> str:
-    return name
-
-
-_objects = _listed_by("lgrasp.object.find:list_objects")
-HAND = named("HAND", _hands, _found_by("lgrasp.hand.names:hand_path"))
-OBJECT = named("OBJECT", _objects, _found_by("lgrasp.object.find:find_object"))
-GRASP_TYPE = named(
-    "NAME", _listed_by("lgrasp.steer.grasp_types:type_names"), _found_by("lgrasp.steer.grasp_types:find_type")
-)
-NETWORK = named(
-    "MODEL", _listed_by("lgrasp.learn.networks:known_networks"), _found_by("lgrasp.learn.networks:find_network")
-)
+_OBJECTS = "lgrasp.object.find:list_objects"
+HAND = named("HAND", _hands, "lgrasp.hand.names:hand_path")
+OBJECT = named("OBJECT", _OBJECTS, "lgrasp.object.find:find_object")
+GRASP_TYPE = named("NAME", "lgrasp.steer.grasp_types:type_names", "lgrasp.steer.grasp_types:find_type")
+NETWORK = named("MODEL", "lgrasp.learn.networks:known_networks", "lgrasp.learn.networks:find_network")
 DEVICE = named("[auto|cpu|cuda:N]", lambda: ("auto", "cpu", "cuda:0"), _device)
 DEVICES = named("[auto|cpu|cuda:N|all]", lambda: ("auto", "cpu", "cuda:0", "all"), _devices)
-# read by the command itself, before it imports anything heavy
-HAND_OR_SHARD, OBJECT_OR_SHARD = named("HAND", _hands, _as_given), named("OBJECT", _objects, _as_given)
-HANDS, OBJECTS = named("HAND", _hands, _as_given), named("OBJECT", _objects, _as_given)
-HAND_OR_OBJECT = named("WHAT", lambda: (*_hands(), *_objects()), _as_given)
-PIPELINE = named("PIPELINE", _listed_by("lgrasp.engine.pipeline:pipeline_files"), _as_given)
-CONFIG = named("CONFIG", _listed_by("lgrasp.jobs.config:config_files"), _as_given)
+HAND_OR_SHARD = HANDS = named("HAND", _hands)
+OBJECT_OR_SHARD = OBJECTS = named("OBJECT", _OBJECTS)
+HAND_OR_OBJECT = named("WHAT", lambda: (*_hands(), *_function(_OBJECTS)()))
+PIPELINE = named("PIPELINE", "lgrasp.engine.pipeline:pipeline_files")
+CONFIG = named("CONFIG", "lgrasp.jobs.config:config_files")

@@ -1,7 +1,8 @@
 """Options that several commands share, with one wording each."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -15,11 +16,24 @@ if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
     from lgrasp.engine.pipeline import Pipeline
 
+
+def _there(context: typer.Context, value: Any) -> Any:
+    """Shards are looked for before anything heavy is imported."""
+    if value and not context.resilient_parsing:
+        from lgrasp.dataset.files import shards_below
+
+        shards_below(value)
+    return value
+
+
 Hand = Annotated[str, Option(help="Name of a hand, a URDF file, or a folder with hand.yaml.", **HAND)]
 HandArgument = Annotated[str, Argument(help="Name of a hand, a URDF file, or a folder with hand.yaml.", **HAND)]
 Mesh = Annotated[str, Option("--object", "-o", help="Mesh file, or the name of an object.", **OBJECT)]
 MeshArgument = Annotated[str, Argument(help="Mesh file, or the name of an object.", **OBJECT)]
-Shards = Annotated[list[Path], Argument(metavar="SHARDS", help="Shard files, or folders; subfolders are searched.")]
+Shards = Annotated[
+    list[Path],
+    Argument(metavar="SHARDS", help="Shard files, or folders; subfolders are searched.", callback=_there),
+]
 PipelineName = Annotated[str, Option("--pipeline", "-p", help="Name of a pipeline, or a YAML file.", **PIPELINE)]
 Seed = Annotated[int | None, Option(help="Base seed; default: the pipeline's.")]
 Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.001 for millimetres).")]
@@ -31,13 +45,10 @@ JsonPath = Annotated[
     str | None,
     Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
 ]
+set_option = partial(Option, "--set", metavar="PART.KEY=VALUE")
+"""Of commands whose parameters have other names."""
 Settings = Annotated[
-    list[str] | None,
-    Option(
-        "--set",
-        metavar="PART.KEY=VALUE",
-        help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.",
-    ),
+    list[str] | None, set_option(help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.")
 ]
 Viewpoint = Annotated[
     str | None, Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
@@ -112,6 +123,15 @@ def with_options(run: Any, command: Any) -> Callable[..., None]:
     run.__signature__ = inspect.Signature(parameters)
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run
+
+
+def options_of(command: Any, words: Sequence[str]) -> set[str]:
+    """Names of the options of the command, below another, that the words of a command line begin with."""
+    for word in words:
+        if (below := getattr(command, "commands", {}).get(word)) is None:
+            break
+        command = below
+    return {name for parameter in command.params for name in parameter.opts}
 
 
 def old_name(command: Callable[..., None], old: str, new: str) -> Callable[..., None]:

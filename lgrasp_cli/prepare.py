@@ -43,12 +43,12 @@ def build_field(
     Example: lgrasp build-field allegro
     """
     cache = open_cache(cache_dir, fresh=rebuild)
-    params = choose_pipeline(pipeline).field
+    params = choose_pipeline(pipeline, settings=[f"field.index={index}"] if index else None).field
     from lgrasp.jobs.prepare import prepare_field
     from lgrasp_cli.progress import Bar
 
     with Bar() as bar:
-        data = prepare_field(cache, hand, params, index=index, device=device, report=bar.share)
+        data = prepare_field(cache, hand, params, device=device, report=bar.share)
     clear = "  ".join(number(share, ".0%") for share in data["clear_share"])
     pairs = [
         ("hand", f"{data['hand']}: {data['groups']} fingers, {data['joints']} joints"),

@@ -148,9 +148,7 @@ class JobProgress(Events):
         self.stop = self.running = False
         self._bar, self._unit = bar, unit
         self._lock = threading.Lock()  # held while the bar is changed
-        self._rows: dict[int, int] = {}  # done, by part
-        self._asked: dict[int, int] = {}
-        self._kept: dict[int, int] = {}  # done before this run
+        self._parts: dict[int, tuple[int, int, int]] = {}  # of each done, asked, and done before this run
 
     def said(self, words: str) -> None:
         self._bar.say(words)
@@ -160,22 +158,23 @@ class JobProgress(Events):
 
     def started(self, parts: "Sequence[Part]", present: Mapping[int, int]) -> None:
         self.running = True
-        self._asked = {part.number: part.rows for part in parts}
-        self._rows, self._kept = dict(present), dict(present)
+        there = [(part, present.get(part.number, 0)) for part in parts]
+        self._parts = {part.number: (done, part.rows, done) for part, done in there}
         self._show()
 
     def advanced(self, part: "Part", done: int, note: str = "", ahead: float = 0.0, kept: int = 0) -> None:
         with self._lock:
-            self._rows[part.number], self._asked[part.number], self._kept[part.number] = done, part.rows, kept
+            self._parts[part.number] = done, part.rows, kept
             self._show(note, ahead)
 
     def wrote(self, part: "Part", made: "Made") -> None:
         with self._lock:
-            self._rows[part.number] = max(made.rows, self._rows.get(part.number, 0))
+            done, asked, kept = self._parts.get(part.number, (0, 0, 0))
+            self._parts[part.number] = max(made.rows, done), asked, kept
             self._show()
 
     def _show(self, note: str = "", ahead: float = 0.0) -> None:
-        done, total, kept = (sum(counts.values()) for counts in (self._rows, self._asked, self._kept))
+        done, total, kept = map(sum, zip((0, 0, 0), *self._parts.values(), strict=True))
         self._bar.show(self._unit, done, total, note, ahead, kept)
 
     def cancelled(self) -> bool:

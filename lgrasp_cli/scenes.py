@@ -23,8 +23,7 @@ _Paths = Annotated[list[Path], Argument(metavar="SCENES", help="Scene files, or 
 def make(
     how: How,
     objects: Annotated[
-        list[str] | None,
-        Argument(help="Names or mesh files of objects; or one config of scenes.", **OBJECT_OR_SHARD),
+        list[str] | None, Argument(help="Names or mesh files of objects; or one config of scenes.", **OBJECT_OR_SHARD)
     ] = None,
     hand: Annotated[str | None, Option(help="Hand; default: that of --grasps, else allegro.", **HAND)] = None,
     scenes: Annotated[int | None, Option("-n", "--scenes", help="Scenes requested; default: 100.")] = None,

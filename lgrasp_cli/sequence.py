@@ -1,19 +1,15 @@
 """``lgrasp sequence`` and ``lgrasp sample``: several objects in one hand, one after another."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
 from lgrasp.choices import Method, Policy
 from lgrasp_cli.names import HAND, NETWORK, OBJECT, PIPELINE, one_of
-from lgrasp_cli.options import Hand, Seed, Settings, Simulate, Viewpoint, choose_pipeline, given, position
+from lgrasp_cli.options import Hand, Seed, Settings, Simulate, Viewpoint, choose_pipeline, position
 from lgrasp_cli.tables import Block, TextTable, counted, following, held, place, share, took
 from lgrasp_cli.working import How, working
-
-if TYPE_CHECKING:
-    from lgrasp.engine.pipeline import Pipeline
-
 
 Objects = Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.", **OBJECT)]
 Rows = Annotated[int, Option("-n", "--rows", help="Complete sequences requested.")]
@@ -53,13 +49,11 @@ def sequence(
 
     Example: lgrasp sequence mug sphere -n 256 --scale 0.06:0.10
     """
-    from lgrasp.jobs.config import sequence_folder
     from lgrasp.jobs.requests.search import SequenceRequest
 
-    chosen = _chosen(pipeline, seed, settings, method=method, policy=policy)
-    what: dict[str, Any] = {"hand": hand, "objects": tuple(objects), "rows": rows, "pipeline": chosen}
-    what |= {"out": out or sequence_folder(hand, objects, chosen, simulate), "scale": scale, "simulate": simulate}
-    how.run(how.job(SequenceRequest, "sequence", shard_rows=shard_rows, **what), _show, _profile)
+    what: dict[str, Any] = {"hand": hand, "objects": tuple(objects), "rows": rows, "method": method, "policy": policy}
+    what |= {"pipeline": choose_pipeline(pipeline, seed, settings=settings), "shard_rows": shard_rows}
+    how.run(how.job(SequenceRequest, "sequence", out=out, scale=scale, simulate=simulate, **what), _show, _profile)
 
 
 @working
@@ -97,25 +91,12 @@ def sample(
 
     Example: lgrasp sample seq-allegro --cloud mug.npz --cloud ball.ply -n 16
     """
-    from lgrasp.cloud.suffixes import cloud_names
-    from lgrasp.jobs.config import sequence_folder
     from lgrasp.jobs.requests.search import SampleRequest
-    from lgrasp.learn.networks import with_network_hand
 
-    chosen = _chosen(pipeline, seed, settings, policy=policy)
-    names = objects or cloud_names(cloud or (), label or ())
-    what = with_network_hand({"hand": hand, "model": model})
-    what |= {"objects": objects, "rows": rows, "pipeline": chosen, "scale": scale}
+    what: dict[str, Any] = {"model": model, "hand": hand, "objects": objects, "rows": rows, "policy": policy}
+    what |= {"pipeline": choose_pipeline(pipeline, seed, settings=settings), "shard_rows": shard_rows}
     what |= {"clouds": cloud, "masks": mask, "labels": label, "viewpoint": position(viewpoint)}
-    what |= {"out": out or sequence_folder(what["hand"], names, chosen, simulate), "simulate": simulate}
-    how.run(how.job(SampleRequest, "sample", shard_rows=shard_rows, **what), _show, _profile)
-
-
-def _chosen(name: str, seed: int | None, settings: list[str] | None, **changes: str | None) -> "Pipeline":
-    """The pipeline with what the options change."""
-    from lgrasp.jobs.requests.search import SequencePipeline
-
-    return SequencePipeline(pipeline=choose_pipeline(name, seed, settings=settings), **given(**changes)).made()
+    how.run(how.job(SampleRequest, "sample", out=out, scale=scale, simulate=simulate, **what), _show, _profile)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

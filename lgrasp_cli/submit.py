@@ -99,15 +99,10 @@ def _checked(program: Any, words: list[str]) -> list[tuple[int, str]]:
         LgraspError: an option, a name, a number or a path that cannot be.
     """
     from lgrasp.errors import ConfigError
+    from lgrasp_cli.options import options_of
     from lgrasp_cli.working import only_checked
 
-    known = program
-    for word in words:
-        if not (known := getattr(known, "commands", {}).get(word)):
-            break
-        if any(option.name == "array" for option in known.params):
-            break
-    if known is None or not any(option.name == "array" for option in known.params):
+    if "--array" not in options_of(program, words):
         raise ConfigError(f"'{' '.join(words[:2])}' is no command that makes files, such as generate, simulate or run")
     for word in words:
         if re.match(r"--(array|dry-run)(=|$)", word):

@@ -117,12 +117,9 @@ def closed(data: dict[str, Any]) -> tuple[str, str]:
 
 def held(data: dict[str, Any]) -> list[tuple[str, str]]:
     """How many of the grasps that were simulated on the way hold; only those are in the files."""
-    counts = data["counts"].get("simulate")
-    return (
-        [("hold", f"all, in {data['protocol']}; {share(counts['held'], counts['tried'])} of those tried")]
-        if counts
-        else []
-    )
+    if not (counts := data["counts"].get("simulate")):
+        return []
+    return [("hold", f"all, in {data['protocol']}; {share(counts['held'], counts['tried'])} of those tried")]
 
 
 def took(data: dict[str, Any], unit: str) -> list[tuple[str, str]]:

@@ -6,6 +6,7 @@ from typing import Annotated
 from typer import Option
 
 from lgrasp.choices import GroupName
+from lgrasp.words import listed
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Shards, split
 from lgrasp_cli.tables import Answer, TextTable, reporting
@@ -19,11 +20,7 @@ def split_rows(
     by: Annotated[str, Option(**one_of(GroupName, "GROUP", "What no two parts share."))],
     out: Annotated[Path, Option("--out", "-o", help="JSON file to write.")] = Path("split.json"),
     shares: Annotated[
-        str,
-        Option(
-            metavar="PART=SHARE,...",
-            help="Parts, and shares of the rows: up to 1 together, or whole numbers.",
-        ),
+        str, Option(metavar="PART=SHARE,...", help="Parts, and shares of the rows: up to 1 together, or whole numbers.")
     ] = "train=0.8,val=0.1,test=0.1",
     seed: Annotated[int, Option(help="Decides which groups go where.")] = 0,
     negatives: Negatives = False,
@@ -34,17 +31,15 @@ def split_rows(
 
     Example: lgrasp dataset split grasps --by object -o split.json
     """
-    from lgrasp.dataset.files import shards_below
     from lgrasp.files import check_file
 
     parts = _shares(shares)
-    shards_below(paths)
     check_file(out)
     from lgrasp.dataset.split import make_split
 
     made = make_split(paths, by=by, shares=parts, seed=seed, negatives=negatives)  # ty: ignore[invalid-argument-type]
     made.write(out)
-    rows = [(name, f"{part.rows:,}", _listed(part.names)) for name, part in made.parts.items()]
+    rows = [(name, f"{part.rows:,}", listed([*dict.fromkeys(part.names)], 4)) for name, part in made.parts.items()]
     return Answer(
         made.model_dump(mode="json"), [TextTable(("part", "rows", by), rows, right=("rows",)), [("where", str(out))]]
     )
@@ -64,10 +59,8 @@ def normalisation(
 
     Example: lgrasp dataset normalisation grasps --split split.json -o normalisation.json
     """
-    from lgrasp.dataset.files import shards_below
     from lgrasp.files import check_file
 
-    shards_below(paths)
     check_file(out)
     from lgrasp.dataset.normalisation import Normalisation
 
@@ -96,8 +89,3 @@ def _shares(text: str) -> dict[str, float]:
     if total > 1 + 1e-6 and any(share % 1 for share in found.values()):
         raise ConfigError(f"--shares {text}: their sum is {total:g}; up to 1 is accepted, or whole numbers")
     return found
-
-
-def _listed(names: tuple[str, ...], most: int = 4) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(dict.fromkeys(names[:most])) + more

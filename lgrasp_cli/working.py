@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,10 +18,9 @@ from lgrasp_cli.tables import Block, print_report
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache
-    from lgrasp.engine.events import JobOutcome
+    from lgrasp.engine.events import Events, JobOutcome
     from lgrasp.engine.request import Request
     from lgrasp.engine.run import Job
-    from lgrasp.jobs.lanes import Lanes
     from lgrasp.runtime.array import Array
 
 
@@ -77,9 +77,8 @@ class How:
     verbose: bool
     devices: str | None = None
     """Several devices, as the option names them."""
-    lanes: "Lanes | None" = None
-    """Those devices at work, on the job of :attr:`number` among others."""
-    number: int = 0
+    outcome: "Callable[[Job, Events], JobOutcome] | None" = None
+    """Has those devices run the job."""
 
     @contextmanager
     def spread(self, jobs: "Sequence[Request]") -> "Iterator[list[How]]":
@@ -100,7 +99,7 @@ class How:
             yield each
             return
         with Lanes(devices, jobs, arrays, self.cache, resume=not self.overwrite) as lanes:
-            yield [replace(how, lanes=lanes, number=number) for number, how in enumerate(each)]
+            yield [replace(how, outcome=partial(lanes.outcome, number)) for number, how in enumerate(each)]
 
     def of_each(self, jobs: "Sequence[Request]") -> "list[How]":
         """The same for each of several jobs, whose parts the tasks of an array share like those of one."""
@@ -241,10 +240,7 @@ def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "JobOutcome"]:
     from lgrasp_cli.progress import Bar, JobProgress, interruptible
 
     with Bar(quiet=how.quiet) as bar, interruptible(JobProgress(bar, job.unit)) as progress, before_end(job.abandon):
-        if how.lanes:
-            outcome = how.lanes.outcome(how.number, job, progress)
-        else:
-            outcome = run(job, progress, array=how.array, resume=not how.overwrite)
+        outcome = (how.outcome or partial(run, array=how.array, resume=not how.overwrite))(job, progress)
     return job_report(outcome), outcome
 
 

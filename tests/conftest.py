@@ -26,9 +26,10 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.find import find_hand
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.runtime.device import resolve_device, start
 from lgrasp.stages.context import Context
 
@@ -171,15 +172,12 @@ def run(job: Callable[..., GenerateJob]) -> Callable[..., JobOutcome]:
 @pytest.fixture
 def known_hands(inputs: Inputs, cache_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Benchmarks, whose cache is empty at first, find the hands of the tests in it."""
-    from lgrasp.bench.rate import Bench
 
-    enter = Bench.__enter__
+    def known(root: Path) -> Cache:
+        shutil.copytree(cache_root / "hand", root / "hand")
+        return Cache(root)
 
-    def known(self: Bench) -> Bench:
-        shutil.copytree(cache_root / "hand", enter(self)._cache.root / "hand")
-        return self
-
-    monkeypatch.setattr(Bench, "__enter__", known)
+    monkeypatch.setattr("lgrasp.bench.comparison.Cache", known)
 
 
 @pytest.fixture

@@ -9,9 +9,10 @@ from typing import Any
 import lgrasp
 from lgrasp.bench.page import Page, Published, caveats, over, times
 from lgrasp.bench.page import Table as Texts
-from lgrasp.bench.rate import Bench
+from lgrasp.bench.rate import measure
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, LgraspError, ObjectError
+from lgrasp.files import temporary_folder
 from lgrasp.jobs.config import JobConfig, in_folder, plan_requests
 from lgrasp.object.find import find_object
 from lgrasp.runtime.device import resolve_device
@@ -95,12 +96,12 @@ def _plan(table: Table) -> dict[str, Any]:
 
 
 def measure_table(
-    bench: Bench, table: Table, config: JobConfig, cache: Cache, *, progress: Callable[[str], None] | None = None
+    table: Table, config: JobConfig, cache: Cache, *, progress: Callable[[str], None] = lambda line: None
 ) -> Iterator[tuple[Table, Cell]]:
     """Measure the cells that a table lacks; the table so far and its newest cell come back after each.
 
     A cell is one hand and one object: all pipelines in turn, ``repeat`` times, the baseline with ``baseline_rows``
-    rows. A cell that cannot be measured says why in ``error`` and does not stop the others.
+    rows. A cell that cannot be measured says why in ``error`` and does not stop the others. Nothing is left behind.
 
     Raises:
         ConfigError: see :func:`plan_requests`.
@@ -110,28 +111,30 @@ def measure_table(
     # plan_requests: pipeline, hand, object; here all pipelines of a hand and object go together
     pairs = [(hand, mesh) for hand in table["hands"] for mesh in table["objects"]]
     done = {(cell["hand"], cell["object"]) for cell in table["cells"]}
-    for first, (hand, mesh) in enumerate(pairs):
-        if (hand, mesh) in done:
-            continue
-        ours = jobs[first :: len(pairs)]
-        if len(ours) > 1:
-            ours[-1] = ours[-1].changed(rows=settings["baseline_rows"])
-        runs, error = [], ""
-        try:
-            runs = bench.measure(ours, settings["repeat"], progress)
-        except LgraspError as problem:
-            error = str(problem)
-        cell = {
-            "hand": hand,
-            "object": mesh,
-            "hand_from": ours[0].hand,
-            "object_from": ours[0].object,
-            "asked": {name: job.rows for name, job in zip(settings["pipelines"], ours, strict=True)},
-            "error": error,
-            "pipelines": dict(zip(settings["pipelines"], runs, strict=False)),
-        }
-        table = with_ratios(table | {"cells": [*table["cells"], cell]})
-        yield table, cell
+    with temporary_folder() as folder:
+        own, built = Cache(folder), {}
+        for first, (hand, mesh) in enumerate(pairs):
+            if (hand, mesh) in done:
+                continue
+            ours = jobs[first :: len(pairs)]
+            if len(ours) > 1:
+                ours[-1] = ours[-1].changed(rows=settings["baseline_rows"])
+            runs, error = [], ""
+            try:
+                runs = measure(ours, settings["repeat"], own, built, progress)
+            except LgraspError as problem:
+                error = str(problem)
+            cell = {
+                "hand": hand,
+                "object": mesh,
+                "hand_from": ours[0].hand,
+                "object_from": ours[0].object,
+                "asked": {name: job.rows for name, job in zip(settings["pipelines"], ours, strict=True)},
+                "error": error,
+                "pipelines": dict(zip(settings["pipelines"], runs, strict=False)),
+            }
+            table = with_ratios(table | {"cells": [*table["cells"], cell]})
+            yield table, cell
 
 
 def with_ratios(table: Table) -> Table:

@@ -279,41 +279,31 @@ def _space_table(title: str, spaces: dict[str, dict[str, int]], published: dict[
 
 def _object_tables(entries: list[dict[str, Any]], published: dict[str, list[float]]) -> list[Table]:
     """Shares and measures by number of objects."""
-    shares, measures = [], []
-    for n, entry in enumerate(entries):
-        shares.append(
-            (
-                str(n + 1),
-                *(number(entry[key]) for key in ("begun", "attempts", "simulated", "strict", "held")),
-                _beside(entry["success"], published["success"], n, *_SHARE),
-                *(number(entry[key], *_SHARE) for key in ("success_of_attempts", "success_of_simulated")),
-            )
+    shares: list[tuple[str, ...]] = [
+        (
+            str(n + 1),
+            *(number(entry[key]) for key in ("begun", "attempts", "simulated", "strict", "held")),
+            _beside(entry["success"], published["success"], n, *_SHARE),
+            *(number(entry[key], *_SHARE) for key in ("success_of_attempts", "success_of_simulated")),
         )
-        measures.append(
-            (
-                str(n + 1),
-                _beside(entry["penetration_mean"], published["penetration"], n, ".2f"),
-                *(number(entry[key], ".2f") for key in ("penetration_median", "penetration_max")),
-                _beside(entry["consumed"], published["consumed"], n, *_SHARE),
-                _beside(entry["seconds_per_256"], published["seconds_per_256"], n, ".1f"),
-                _beside(entry["diversity"], published["diversity"], n, ".3f"),
-                number(entry["drawn_per_attempt"], ".0f"),
-                number(entry["passed"], *_SHARE),
-            )
+        for n, entry in enumerate(entries)
+    ]
+    measures: list[tuple[str, ...]] = [
+        (
+            str(n + 1),
+            _beside(entry["penetration_mean"], published["penetration"], n, ".2f"),
+            *(number(entry[key], ".2f") for key in ("penetration_median", "penetration_max")),
+            _beside(entry["consumed"], published["consumed"], n, *_SHARE),
+            _beside(entry["seconds_per_256"], published["seconds_per_256"], n, ".1f"),
+            _beside(entry["diversity"], published["diversity"], n, ".3f"),
+            number(entry["drawn_per_attempt"], ".0f"),
+            number(entry["passed"], *_SHARE),
         )
+        for n, entry in enumerate(entries)
+    ]
     of = ("objects", "begun", "attempts", "simulated", "strict", "hold", "hold/begun", "hold/attempts", "hold/sim")
-    by = (
-        "objects",
-        "penetration: mean mm",
-        "median",
-        "largest",
-        "consumed",
-        "s per 256 attempts",
-        "diversity",
-        "drawn",
-        "pass",
-    )
-    return [Table("", of, shares), Table("", by, measures)]
+    by = ("objects", "penetration: mean mm", "median", "largest", "consumed", "s per 256 attempts", "diversity")
+    return [Table("", of, shares), Table("", (*by, "drawn", "pass"), measures)]
 
 
 def _rate_table(result: dict[str, Any]) -> Table:

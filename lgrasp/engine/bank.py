@@ -2,7 +2,9 @@
 interruption any run."""
 
 import json
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,25 +12,41 @@ from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import InputKeys
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
+from lgrasp.runtime.tally import covered
 
 BANK_VERSION = 5
 """Raised whenever the arrays of an entry change meaning; the versions of the stages are in the key too."""
 _NUMBERS_MEMBER = "about"  # member with the numbers
+_BANKED = ("candidates", "duplicates", "counts", "seconds", "spans", "waited")  # those of a result
 
 
-@dataclass(frozen=True)
-class Account:
-    """A shard so far: the first ``kept`` rows are its own, later ones were found with the last and not looked at."""
+@dataclass
+class ShardResult:
+    """Rows of a shard and how they came about."""
 
     grasps: GraspTable
-    kept: int
-    candidates: int  # tried: the next batch begins there
-    duplicates: int
-    counts: dict[str, dict[str, int]]
-    seconds: dict[str, float]  # thread-seconds per stage
-    spans: list[tuple[float, float]]  # from when to when each run took [s since 1970]
+    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)  # thread-seconds per stage
+    spans: list[tuple[float, float]] = field(default_factory=list)  # from when to when each run took [s since 1970]
     waited: float = 0.0  # while other shards used the device [s]
-    interrupted: bool = False
+    candidates: int = 0
+    duplicates: int = 0
+    exhausted: bool = False  # the effort bound was reached before the rows were
+    resumed: int = 0  # rows that an earlier run found
+    tally: Counter[str] = field(default_factory=Counter)  # what the job counts among its rows
+
+    @property
+    def wall(self) -> float:
+        """Placement through filter, of all runs, without waiting for shards that are made side by side [s]."""
+        return max(covered(self.spans) - self.waited, 0.0)
+
+
+class Account(NamedTuple):
+    """A shard so far: the first ``kept`` rows are its own, later ones were found with the last and not looked at."""
+
+    found: ShardResult
+    kept: int
+    interrupted: bool
 
 
 @dataclass(frozen=True)
@@ -64,8 +82,9 @@ class Bank:
             return None
         try:
             about = json.loads(str(arrays.pop(_NUMBERS_MEMBER)))
+            kept, interrupted = about.pop("kept"), about.pop("interrupted")
             about["spans"] = [(begin, end) for begin, end in about["spans"]]
-            account = Account(grasps_from_arrays(arrays), **about)
+            account = Account(ShardResult(grasps_from_arrays(arrays), **about), kept, interrupted)
         except (KeyError, ValueError, TypeError):
             self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; rebuilding it")
             return None
@@ -73,10 +92,10 @@ class Bank:
 
     def store(self, account: Account) -> None:
         """Keep the account, in place of an earlier one."""
-        about = {name: value for name, value in vars(account).items() if name != "grasps"}
-        self.cache.store(
-            "bank", self.key, grasp_arrays(account.grasps) | {_NUMBERS_MEMBER: np.asarray(json.dumps(about))}
-        )
+        about = {"kept": account.kept, "interrupted": account.interrupted}
+        about |= {name: getattr(account.found, name) for name in _BANKED}
+        arrays = grasp_arrays(account.found.grasps) | {_NUMBERS_MEMBER: np.asarray(json.dumps(about))}
+        self.cache.store("bank", self.key, arrays)
 
     def discard(self) -> None:
         """Forget the account, if there is one."""

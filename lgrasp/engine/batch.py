@@ -51,11 +51,8 @@ def run_stages(
     pipeline: Pipeline, context: Context, first: int | wp.array, count: int, last: str, meter: Meter | None = None
 ) -> Any:
     """The table of stage ``last`` for candidates ``first .. first + count - 1``, all stages before it included."""
-    meter = meter or Meter(context.device)
-    table: Any = (first, count)
-    for stage in pipeline.order[: pipeline.order.index(last) + 1]:
-        table = run_stage(stage, table, pipeline, context, meter)
-    return table
+    stages = pipeline.order[: pipeline.order.index(last) + 1]
+    return _run_through(stages, (first, count), pipeline, context, meter or Meter(context.device))
 
 
 def run_stage(stage: str, table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> Any:
@@ -136,7 +133,7 @@ def run_batch(
     return BatchResult(grasps, meter.counts, meter.seconds)
 
 
-def _run_through(stages: Sequence[str], table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> GraspTable:
+def _run_through(stages: Sequence[str], table: Any, pipeline: Pipeline, context: Context, meter: Meter) -> Any:
     for stage in stages:
         table = run_stage(stage, table, pipeline, context, meter)
     return table

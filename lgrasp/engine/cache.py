@@ -26,8 +26,12 @@ _NAMES = "/names"  # member that lists the others
 
 def content_key(kind: str, version: int, **parts: Any) -> str:
     """Key of an artifact: SHA-256 of its kind, code version and everything it depends on (JSON-serialisable)."""
-    text = json.dumps({"format": _FORMAT, "kind": kind, "version": version, **parts}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return json_digest({"format": _FORMAT, "kind": kind, "version": version, **parts})
+
+
+def json_digest(value: Any) -> str:
+    """SHA-256 of a JSON-serialisable value, whatever the order of keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)

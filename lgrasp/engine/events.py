@@ -91,11 +91,6 @@ class JobOutcome:
         """Rows on disk of this task's parts."""
         return self.made + self.present
 
-    @property
-    def wall(self) -> float:
-        """Of the whole call [s]."""
-        return self.seconds["total"]
-
 
 class Events:
     """Notifications and queries of a running job; every method may be overridden."""

@@ -1,7 +1,5 @@
 """Hand, object and field of a job: found, cached, loaded onto a device."""
 
-import hashlib
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.cache import Cache, content_key, json_digest
 from lgrasp.errors import ObjectError
 from lgrasp.field.arrays import FieldArrays, upload_field
 from lgrasp.field.model import FIELD_VERSION, ContactField
@@ -255,6 +253,4 @@ def load_inputs(
 
 def run_key(pipeline: dict, keys: InputKeys, shard_rows: int) -> str:
     """Content key of a run: everything that decides its rows."""
-    return hashlib.sha256(
-        json.dumps([pipeline, keys.hand, keys.object, keys.field, shard_rows], sort_keys=True).encode()
-    ).hexdigest()
+    return json_digest([pipeline, keys.hand, keys.object, keys.field, shard_rows])

@@ -29,46 +29,16 @@ from lgrasp.files import remove_leftovers, writing
 _MOST_LISTING = 0.05  # share of a job's time that manifests may take while it runs
 
 
-@contextmanager
-def listing(
-    describe: Callable[[], ListedRun],
-    root: Path,
-    every: Sequence[Part],
-    own: Sequence[Part],
-    present: Mapping[int, int],
-    *,
-    asks: bool,
-) -> Iterator["Listing"]:
-    """Keep the manifests of a job's folders while its parts are made.
-
-    Where nothing is made, nothing is left behind, neither a manifest nor a folder.
+class Listing:
+    """The entries of a job in the manifests of its folders.
 
     Args:
         describe: gives the job, without shards; called if there is something to list.
         root: folder of the job.
         every: all parts of the job.
         own: those of this process.
-        present: rows of those that are there, by number.
         asks: the parts ask for a number of rows.
-
-    Raises:
-        OutputError: a folder cannot be written.
     """
-    found = Listing(describe, root, every, own, asks=asks)
-    try:
-        found.ask(present)
-        yield found
-        found.flush()
-    except BaseException:
-        with suppress(OutputError):  # the first error says more
-            found.flush()
-        raise
-    finally:
-        found.close()
-
-
-class Listing:
-    """The entries of a job in the manifests of its folders; see :func:`listing`."""
 
     def __init__(
         self, describe: Callable[[], ListedRun], root: Path, every: Sequence[Part], own: Sequence[Part], *, asks: bool
@@ -83,6 +53,28 @@ class Listing:
         self._flushed = 0.0  # when, and how long it took [s]
         self._took = 0.0
 
+    @contextmanager
+    def kept(self, present: Mapping[int, int]) -> "Iterator[Listing]":
+        """Keep the manifests while the parts are made; where nothing is made, nothing is left behind, neither a
+        manifest nor a folder.
+
+        Args:
+            present: rows of the parts that are there, by number.
+
+        Raises:
+            OutputError: a folder cannot be written.
+        """
+        try:
+            self.ask(present)
+            yield self
+            self.flush()
+        except BaseException:
+            with suppress(OutputError):  # the first error says more
+                self.flush()
+            raise
+        finally:
+            self.close()
+
     @cached_property
     def run(self) -> ListedRun:
         """The job, without shards."""
@@ -95,7 +87,7 @@ class Listing:
             self._mark.enter_context(working_on(self._root, self.run.run_key))
         for folder, own in self.folders.items():
             remove_leftovers(folder, TEMPORARY)
-            known = _entries(folder, self.run)
+            known = _manifest(folder).entries(self.run)
             there = {part.number for part in own if part.number in present}
             shards = []
             for part in self._every[folder]:
@@ -163,20 +155,17 @@ class Listing:
 
 def begun_array(parts: Sequence[Part]) -> str:
     """The array of SLURM that began the run of some parts, as the manifest tells; "" if none did."""
-    with suppress(ShardError):
-        for part in parts[:1]:
-            manifest = read_manifest(part.file.parent / MANIFEST)
-            runs = manifest.runs if manifest else []
-            return next((r.array for r in runs if any(s.file == part.file.name for s in r.shards)), None) or ""
+    for part in parts[:1]:
+        runs = _manifest(part.file.parent).runs
+        return next((r.array for r in runs if any(s.file == part.file.name for s in r.shards)), None) or ""
     return ""
 
 
-def _entries(folder: Path, run: ListedRun) -> dict[str, ListedShard]:
-    """What the manifest of a folder says of the files of a run."""
+def _manifest(folder: Path) -> Manifest:
+    """The manifest of a folder; an empty one where there is none, or a damaged one."""
     with suppress(ShardError):
-        manifest = read_manifest(folder / MANIFEST)
-        return manifest.entries(run) if manifest else {}
-    return {}
+        return read_manifest(folder / MANIFEST) or Manifest()
+    return Manifest()
 
 
 def _by_folder(parts: Sequence[Part]) -> dict[Path, list[Part]]:
@@ -188,39 +177,33 @@ def _by_folder(parts: Sequence[Part]) -> dict[Path, list[Part]]:
     return found
 
 
-@contextmanager
-def renewing(parts: Sequence[Part], present: Mapping[int, int]) -> Iterator["Renewing"]:
-    """Keep the manifests of the folders of parts, whose files are replaced.
-
-    A file that is going to be replaced is listed without size and SHA-256 until it is, so that a process may be killed
-    at any moment. Folders without a manifest get none.
-
-    Args:
-        present: rows of the parts that are made already, by number.
-
-    Raises:
-        OutputError: a folder cannot be written.
-    """
-    found = Renewing({part.file for part in parts if part.number not in present})
-    try:
-        found.begin([part.file for part in parts])
-        yield found
-    finally:
-        found.close()
-
-
 class Renewing:
-    """Entries of files that are replaced; see :func:`renewing`."""
+    """Entries of files that are replaced, in the folders that have a manifest."""
 
-    def __init__(self, changing: set[Path]) -> None:
-        self._changing, self._lock = changing, threading.Lock()
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self._parts, self._lock = parts, threading.Lock()
+        self._changing: set[Path] = set()
 
-    def begin(self, files: Collection[Path]) -> None:
-        """List files as they are, but for those that are going to change."""
-        for folder in {file.parent for file in files}:
-            remove_leftovers(folder, TEMPORARY)
-        _renew([file for file in files if file not in self._changing])
-        _renew(self._changing, changing=True)
+    @contextmanager
+    def kept(self, present: Mapping[int, int]) -> "Iterator[Renewing]":
+        """Keep the manifests while files are replaced: one that is going to be is listed without size and SHA-256 until
+        it is, so that a process may be killed at any moment.
+
+        Args:
+            present: rows of the parts that are made already, by number.
+
+        Raises:
+            OutputError: a folder cannot be written.
+        """
+        self._changing = {part.file for part in self._parts if part.number not in present}
+        try:
+            for folder in {part.file.parent for part in self._parts}:
+                remove_leftovers(folder, TEMPORARY)
+            _renew([part.file for part in self._parts if part.file not in self._changing])
+            _renew(self._changing, changing=True)
+            yield self
+        finally:
+            self.close()
 
     def record(self, part: Part, rows: int, *, written: bool) -> None:
         """List a file as it is now."""

@@ -22,8 +22,14 @@ from lgrasp.steer.params import NOTHING, Steering
 _ORDER_VERSION = 2
 """Raised whenever the same candidates give the rows of a shard in another order."""
 
-
-_PARTS = ("bounds", "steer", "hand", "object", "field")
+_PARTS: dict[str, type[Params]] = {
+    "bounds": GraspBounds,
+    "steer": Steering,
+    "hand": HandParams,
+    "object": ObjectParams,
+    "field": FieldParams,
+}
+"""What has parameters besides the stages."""
 
 
 class _Head(Params):
@@ -201,14 +207,6 @@ class Pipeline(_Head):
         shared = {name: made[name] for name in _PARTS} | {"sequence": made.get("sequence")}
         return self.model_copy(update=shared | {"stages": tuple((name, made[name]) for name in self.order)}).checked()
 
-    def with_passes(self, passes: int | None) -> "Pipeline":
-        """A copy with some passes over its candidates, if they are given.
-
-        Raises:
-            ConfigError: passes out of range.
-        """
-        return self if passes is None else self.with_params("search", passes=passes)
-
     def with_seed(self, seed: int | None, name: str = "seed") -> "Pipeline":
         """A copy with another base seed, if one is given; ``name`` is what the user calls it.
 
@@ -245,8 +243,7 @@ class Pipeline(_Head):
             ConfigError: no such protocol.
         """
         params = parse_model(STAGES["simulate"].params, {"protocol": protocol}, "--simulate")
-        stages = tuple((name, own) for name, own in self.stages if name != "simulate")
-        return self.model_copy(update={"stages": (*stages, ("simulate", params))})
+        return self.model_copy(update={"stages": (*self.without("simulate").stages, ("simulate", params))})
 
     def describe(self) -> dict[str, Any]:
         """JSON-serialisable description, the same for equal pipelines; execution settings are not in it."""
@@ -293,11 +290,7 @@ def load_pipeline(name: str) -> Pipeline:
     check_order(tuple(n for n, _ in stages), where)
     return Pipeline(
         **{name: getattr(declared, name) for name in _Head.model_fields},
-        bounds=parse_model(GraspBounds, declared.bounds, f"{where}, bounds"),
-        steer=parse_model(Steering, declared.steer, f"{where}, steer"),
-        hand=parse_model(HandParams, declared.hand, f"{where}, hand"),
-        object=parse_model(ObjectParams, declared.object, f"{where}, object"),
-        field=parse_model(FieldParams, declared.field, f"{where}, field"),
+        **{name: parse_model(kind, getattr(declared, name), f"{where}, {name}") for name, kind in _PARTS.items()},
         stages=tuple(stages),
         sequence=None if sequence is None else parse_model(SEQUENCE.params, sequence, f"{where}, {SEQUENCE.name}"),
     ).checked()

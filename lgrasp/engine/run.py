@@ -4,9 +4,9 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -19,7 +19,7 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError, Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found, clean_folder, found_shard, neighbours
-from lgrasp.engine.listing import Listing, Renewing, begun_array, listing, renewing
+from lgrasp.engine.listing import Listing, Renewing, begun_array
 from lgrasp.engine.request import Request
 from lgrasp.errors import LgraspError, OutputError, ShardError
 from lgrasp.files import check_folder
@@ -250,7 +250,10 @@ def run(
     events.started(parts, present)
     begin = time.perf_counter()
     try:
-        with _manifests(job, array, every, parts, present) as job._manifests:
+        manifests = Renewing(parts)
+        if not job.in_place:
+            manifests = Listing(lambda: _described(job, array), job.folder, every, parts, asks=job.asks)
+        with manifests.kept(present) as job._manifests:
             _make_parts(job, events, outcome, job._manifests, replaces=[] if resume else every)
     except CancelledError:
         outcome.cancelled = True
@@ -274,14 +277,6 @@ def prepare(job: Job, todo: "Todo") -> float:
             load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading)
             warmed.result()
     return time.perf_counter() - begin
-
-
-def _manifests(
-    job: Job, array: Array, every: Sequence[Part], parts: Sequence[Part], present: Mapping[int, int]
-) -> AbstractContextManager[Listing | Renewing]:
-    if job.in_place:
-        return renewing(parts, present)
-    return listing(lambda: _described(job, array), job.folder, every, parts, present, asks=job.asks)
 
 
 def _described(job: Job, array: Array) -> ListedRun:

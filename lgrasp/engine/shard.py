@@ -1,16 +1,15 @@
 """One shard: a pure function of (pipeline, hand, object, shard rows, shard index)."""
 
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from lgrasp.engine.bank import Account, Bank
+from lgrasp.engine.bank import Account, Bank, ShardResult
 from lgrasp.engine.batch import PASS_BLOCK, BatchResult, block_size, run_batch
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError
@@ -22,7 +21,7 @@ from lgrasp.grasp.duplicates import KeptRows
 from lgrasp.grasp.row_order import RowOrder
 from lgrasp.grasp.tables import GraspTable, join_rows, no_grasps, take_rows
 from lgrasp.runtime.ordered import in_order
-from lgrasp.runtime.tally import add_counts, add_seconds, covered
+from lgrasp.runtime.tally import add_counts, add_seconds
 from lgrasp.runtime.turn import waited
 from lgrasp.stages.context import Context
 
@@ -37,7 +36,6 @@ _GPU_SMALLEST, _GPU_LARGEST = 2_048, 65_536  # candidates of a batch
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
 _CONTACT_BYTES = 64  # the same for a contact of its domain
 _SET_BYTES = 32  # the same for a set of contacts
-_BANKED = ("candidates", "duplicates", "counts", "seconds", "spans", "waited")  # fields of results in the bank
 _STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
 
@@ -49,27 +47,6 @@ class Execution:
     batch: int = 0  # candidates per batch; 0: by device
     rate: float = 1.0  # rows expected per candidate, until there are some: sizes the first batch on a GPU
     graphs: GraphCache | None = None  # replays batches; for one worker a shard
-
-
-@dataclass
-class ShardResult:
-    """Rows of a shard and how they came about."""
-
-    grasps: GraspTable
-    counts: dict[str, dict[str, int]] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)  # thread-seconds per stage
-    spans: list[tuple[float, float]] = field(default_factory=list)  # from when to when each run took [s since 1970]
-    waited: float = 0.0  # while other shards used the device [s]
-    candidates: int = 0
-    duplicates: int = 0
-    exhausted: bool = False  # the effort bound was reached before the rows were
-    resumed: int = 0  # rows that an earlier run found
-    tally: Counter[str] = field(default_factory=Counter)  # what the job counts among its rows
-
-    @property
-    def wall(self) -> float:
-        """Placement through filter, of all runs, without waiting for shards that are made side by side [s]."""
-        return max(covered(self.spans) - self.waited, 0.0)
 
 
 def flat_statistics(counts: dict[str, dict[str, int]], seconds: Mapping[str, float]) -> dict[str, int | float]:
@@ -188,12 +165,12 @@ def make_shard(
     block = block_size(pipeline)
     turn = graphs.turn if graphs else nullcontext()
     found = _Rows(inputs, RowOrder(pipeline.seed, shard, block), rows, turn)
-    result = found.result
     account = bank.load(rows, whole=resume) if bank else None
     if account:
         found.restore(account)
+    result = found.result
     start = time.time()
-    fixed = _fixed_batch(context, execution)
+    fixed = execution.batch or (_PHYSICS_BATCH if context.scene and device == "cpu" else 0)  # 0: as many as seem best
     most = _GPU_LARGEST if device == "cpu" else _most_candidates(device, inputs.hand.model.groups, pipeline)
 
     def size(running: int) -> int:
@@ -272,13 +249,6 @@ def make_shard(
     return result
 
 
-def _fixed_batch(context: Context, execution: Execution) -> int:
-    """Candidates of every batch; 0: as many as seem best."""
-    if execution.batch == 0 and context.scene and context.device == "cpu":
-        return _PHYSICS_BATCH
-    return execution.batch
-
-
 class _Rows:
     """Rows of a shard as they come in: near-duplicates are left out, rows beyond those asked are set aside."""
 
@@ -324,19 +294,15 @@ class _Rows:
 
     def restore(self, account: Account) -> None:
         """Start from the state of an earlier run."""
-        table = account.grasps
-        own = np.arange(account.kept)
+        table, own = account.found.grasps, np.arange(account.kept)
         self._kept.restore(user_poses(table.pose[own], self._center), table.q[own])
         self._parts.append((table, own))
-        result = self.result
-        for name in _BANKED:
-            setattr(result, name, getattr(account, name))
+        self.result = replace(account.found, grasps=no_grasps())
         self.add(take_rows(table, slice(account.kept, None)))
-        result.resumed = self.count
+        self.result.resumed = self.count
 
     def account(self, *, interrupted: bool = False) -> Account:
         """How far the shard has come."""
         own = self.shuffled() if interrupted else self.result.grasps
         table = join_rows([own, take_rows(*self._aside)] if self._aside else [own])
-        banked = {name: getattr(self.result, name) for name in _BANKED}
-        return Account(table, self.count, interrupted=interrupted, **banked)
+        return Account(replace(self.result, grasps=table), self.count, interrupted)

@@ -73,17 +73,18 @@ class ShardJob(ShardRequest, Job):
         """Content key of the job and of the rows of an open shard."""
         return content_key("part", 1, job=self.key(), rows=rows_digest(reader))
 
-    def extend(self, part: Part, key: str, **added: Any) -> None:
-        """Write the file of a part: its source with more columns, see :func:`extend_shard`. Of several processes that
-        add to one shard, each adds to what the others wrote.
+    def write(self, part: Part, contents: Any) -> None:
+        """Write the file of a part: its source with more columns. Of several processes that add to one shard, each adds
+        to what the others wrote.
 
         Args:
-            key: :meth:`key_of` the rows that the columns are of.
+            contents: :meth:`key_of` the rows that the columns are of, and what :func:`extend_shard` adds.
 
         Raises:
             ShardError: the source has other rows by now.
         """
         assert part.source is not None
+        key, added = contents
         with locked(part.source) if self.in_place else nullcontext():
             if self.part_key(part) != key:
                 raise ShardError(f"{part.source}: its rows were replaced while they were worked on; run it again")

@@ -28,9 +28,9 @@ from lgrasp.engine.pipeline import Pipeline, load_pipeline
 from lgrasp.engine.request import Request, named
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
-from lgrasp.hand.names import all_hands, hand_path, known_hands
-from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest
-from lgrasp.jobs.sets import SequenceSets, object_sequences, sequence_name
+from lgrasp.hand.names import all_hands
+from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest, hand_name, sequence_name
+from lgrasp.jobs.sets import SequenceSets, object_sequences
 from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object
 from lgrasp.steer.params import Steering
@@ -157,12 +157,7 @@ def load_requests(name: str, changes: dict[str, Any]) -> ConfigJobs:
     if kind == "generate" or "sequences" in data:
         return ConfigJobs(plan_requests(parse_model(JobConfig, data, f"config {path}")), devices)
     data.pop("description", None)
-    model = named(KINDS[kind])
-    usual = "out" not in data and issubclass(model, SequenceRequest)
-    request = parse_model(model, data | ({"out": Path()} if usual else {}), f"config {path}")
-    if usual:
-        request.out = sequence_folder(request.hand, request.names, request.pipeline, request.simulate)
-    return ConfigJobs([request], devices)
+    return ConfigJobs([parse_model(named(KINDS[kind]), data, f"config {path}")], devices)
 
 
 def plan_requests(config: JobConfig) -> list[Request]:
@@ -173,7 +168,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
             for the sequences.
     """
     objects, sets = _objects(config), config.sequences
-    drawn = object_sequences(objects, sets, config.seed or 0) if sets else [(mesh,) for mesh in objects]
+    drawn = object_sequences(objects, sets, config.seed or 0) if sets else []
     hands = [_urdf_in_folder(config.hand_dir, hand) for hand in all_hands(config.hands)]
     shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
     found: list[Request] = []
@@ -182,25 +177,20 @@ def plan_requests(config: JobConfig) -> list[Request]:
     for pipeline in _pipelines(config):
         if not sets:
             meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
-            own = pipeline.with_passes(config.passes)
+            own = pipeline.with_params("search", passes=config.passes) if config.passes else pipeline
             own = own.with_table() if config.table else own
             more = config.model_dump(include={"scale", "batch", "negatives"})
             found += pair_requests(hands, meshes, own, config.out, **shared, **more)
             continue
-        changes = {name: value for name in ("method", "policy") if (value := getattr(sets, name))}
-        own = pipeline.with_params("sequence", **changes) if changes else pipeline
-        what: dict[str, Any] = {
-            "shard_rows": min(config.shard_rows, 1000),
-            "scale": sets.scale,
-            "simulate": sets.simulate,
-        }
+        what = shared | sets.model_dump(include={"scale", "simulate", "method", "policy"})
+        what |= {"shard_rows": min(config.shard_rows, 1000), "pipeline": pipeline}
         for hand, names in itertools.product(hands, drawn):
             meshes = tuple(in_folder(config.object_dir, mesh) for mesh in names)
             called = _names(hand, meshes[0], known_name)[0]
             out = run_folder(config.out, called, sequence_name(names), pipeline.name, sets.simulate)
             if (other := takers.setdefault(out, hand)) != hand:
                 raise ConfigError(_one_folder(other, hand, out))
-            found.append(SequenceRequest(**shared | what, hand=hand, objects=meshes, pipeline=own, out=out))
+            found.append(SequenceRequest(**what, hand=hand, objects=meshes, out=out))
     return found
 
 
@@ -252,25 +242,6 @@ def _names(hand: str, mesh: str, called: Callable[[str], str]) -> tuple[str, str
         names = names[0], find_object(mesh).stem
         names = called(hand), names[1]
     return names
-
-
-def sequence_folder(hand: str, objects: Sequence[str], pipeline: Pipeline, protocol: str | None) -> Path:
-    """Where the shards of sequences go unless it is said."""
-    return run_folder(Path("grasps"), hand_name(hand), sequence_name(tuple(objects)), pipeline.name, protocol)
-
-
-def hand_name(hand: str) -> str:
-    """What a hand is called in the names of folders.
-
-    Raises:
-        HandError: there is no such hand.
-    """
-    if hand in known_hands():  # one of the catalogue is called by its folder
-        return hand
-    hand_path(hand)
-    from lgrasp.jobs.hands import hand_source  # slow to load: only for what is there
-
-    return hand_source(hand).name
 
 
 def _pipelines(config: JobConfig) -> Iterator[Pipeline]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.formats import FORMATS, export_shards
-from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.dataset.exports.selection import chosen_rows, number_columns
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
@@ -65,18 +64,13 @@ class ExportJob(ExportRequest, Job):
         return {0: rows}
 
     def make(self, part: Part, progress: PartProgress) -> Made:
-        done = export_shards(
-            self.shards,
-            self.out,
-            self.to,
-            where=self.where,
-            limit=self.limit,
-            split=self.split,
-            licence=self.licence,
-            cut=self._cut() if self.to == "mjcf" else None,
-            advance=lambda done, total: replace(progress, part=replace(part, rows=total))(done),
-            run_key=self.key(),
-        )
+        how: dict[str, Any] = {name: getattr(self, name) for name in ("where", "limit", "split", "licence")}
+        how |= {"run_key": self.key(), "cut": self._cut if self.to == "mjcf" else None}
+
+        def advance(done: int, total: int) -> None:
+            replace(progress, part=replace(part, rows=total))(done)
+
+        done = export_shards(self.shards, self.out, self.to, advance=advance, **how)
         return Made(done.rows, (), list(done.objects))
 
     def write(self, part: Part, contents: Any) -> None:
@@ -84,20 +78,15 @@ class ExportJob(ExportRequest, Job):
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``objects`` (their codes), ``format``."""
-        objects: list[str] = []
-        for path in outcome.paths:
-            objects = list(json.loads(path.read_bytes())["objects"])
+        objects = [code for path in outcome.paths for code in json.loads(path.read_bytes())["objects"]]
         return {"grasps": outcome.rows, "objects": objects, "format": self.to}
 
-    def _cut(self) -> Cut:
-        """Convex pieces of objects as the simulation makes them, from the cache; approximations are reported."""
+    def _cut(self, record: ObjectRecord) -> Sequence[np.ndarray]:
+        """Convex pieces of an object as the simulation makes them, from the cache; approximations are reported."""
         from lgrasp.geometry.decompose import decompose
         from lgrasp.simulate.solid import object_of_record
 
-        def cut(record: ObjectRecord) -> Sequence[np.ndarray]:
-            solid = object_of_record(record, partial(decompose, store=self.cache))
-            for note in solid.notes:
-                self.cache.warn(f"object '{record.name}': {note}")
-            return solid.pieces
-
-        return cut
+        solid = object_of_record(record, partial(decompose, store=self.cache))
+        for note in solid.notes:
+            self.cache.warn(f"object '{record.name}': {note}")
+        return solid.pieces

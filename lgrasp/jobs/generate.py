@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -17,7 +18,6 @@ from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run_key
-from lgrasp.engine.run import run
 from lgrasp.engine.shard import Execution, gave_up, make_shard
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
@@ -33,7 +33,6 @@ from lgrasp.jobs.requests.search import GenerateRequest
 from lgrasp.jobs.row_counts import count_made, count_written
 from lgrasp.jobs.search import SearchJob
 from lgrasp.policy.names import SHIPPED
-from lgrasp.runtime.array import Array
 from lgrasp.runtime.cores import cores
 from lgrasp.runtime.processes import ProcessPool, none_killed
 from lgrasp.words import plural
@@ -75,13 +74,11 @@ class GenerateJob(GenerateRequest, SearchJob):
     def protocol(self) -> str | None:
         return self.pipeline.params("simulate").protocol if "simulate" in self.pipeline.order else None
 
-    @property
+    @cached_property
     def keys(self) -> InputKeys:
         """Content keys of hand, object and field."""
-        if self._keys is None:
-            source, pipeline = hand_source(self.hand), self.pipeline
-            self._keys = input_keys(source, self.object, self.scale, pipeline.object, pipeline.field, pipeline.hand)
-        return self._keys
+        source, pipeline = hand_source(self.hand), self.pipeline
+        return input_keys(source, self.object, self.scale, pipeline.object, pipeline.field, pipeline.hand)
 
     @property
     def measured_rate(self) -> float:
@@ -256,10 +253,3 @@ def _near_duplicates(paths: Collection[Path], device: str) -> int:
     if not poses:
         return 0
     return len(np.unique(near_pairs(np.concatenate(poses), np.concatenate(postures), device)[:, 1]))
-
-
-def generate(
-    job: GenerateJob, events: Events | None = None, *, array: Array | tuple[int, int] = (0, 1), resume: bool = True
-) -> JobOutcome:
-    """Make the missing shards of a job; see :func:`lgrasp.engine.run.run`."""
-    return run(job, events, array=array, resume=resume)

@@ -23,7 +23,13 @@ def hand_source(name: str) -> HandSource:
     Raises:
         HandError: nothing of that name, or a URDF that no rules can be drafted for.
     """
-    return find_hand(name, _draft)
+
+    def draft(urdf: Path, name: str) -> Path:
+        from lgrasp.hand.drafting.import_urdf import drafted_folder  # needed by few hands, and slow to load
+
+        return drafted_folder(urdf, name)
+
+    return find_hand(name, draft)
 
 
 def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
@@ -36,30 +42,22 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
         ConfigError: see :func:`~lgrasp.steer.typed.typed`, :func:`~lgrasp.steer.typed.asked_sides` and
             :func:`~lgrasp.steer.typed.asked_thumb`; a policy that is none, or of another hand.
     """
-    return _within_reach(_looked_up(_suited(pipeline, hand), hand), hand)
-
-
-def _looked_up(pipeline: Pipeline, hand: str) -> Pipeline:
-    policy, steer = pipeline.params("place").policy, pipeline.steer
-    looked_up = steer.grasp_type is not None or steer.thumb is not None or any(steer.sides.values())
-    if not looked_up and policy is None:
-        return pipeline
     source = hand_source(hand)
+    urdf = read_urdf(source.urdf)
+    tree = build_tree(urdf, source.spec)
+    pipeline = pipeline.suited(float(tree.dof_free.mean()))
+    policy, steer = pipeline.params("place").policy, pipeline.steer
     if policy == SHIPPED:
         shipped = own_policy(pipeline, source)
         pipeline = pipeline.with_params("place", policy=str(shipped) if shipped else None)
-    if not looked_up and policy in (None, SHIPPED):
-        return pipeline
-    urdf = read_urdf(source.urdf)
-    tree = build_tree(urdf, source.spec)
-    if policy not in (None, SHIPPED):
+    elif policy is not None:
         read_policy(policy).check_hand(source.name, tree.joint_names, policy)
-    if not looked_up:
-        return pipeline
-    anatomy = Anatomy(source.spec, urdf, tree)
-    steer = typed(steer, anatomy)
-    asked = {"sides": asked_sides(steer, anatomy), "thumb": asked_thumb(steer, anatomy)}
-    return pipeline.model_copy(update={"steer": steer, "hand": pipeline.hand.model_copy(update=asked)})
+    if steer.grasp_type is not None or steer.thumb is not None or any(steer.sides.values()):
+        anatomy = Anatomy(source.spec, urdf, tree)
+        steer = typed(steer, anatomy)
+        asked = {"sides": asked_sides(steer, anatomy), "thumb": asked_thumb(steer, anatomy)}
+        pipeline = pipeline.model_copy(update={"steer": steer, "hand": pipeline.hand.model_copy(update=asked)})
+    return _within_reach(pipeline, source, tree.groups)
 
 
 def own_policy(pipeline: Pipeline, hand: HandSource) -> Path | None:
@@ -70,27 +68,13 @@ def own_policy(pipeline: Pipeline, hand: HandSource) -> Path | None:
     return shipped_policy(hand.known or hand.name, pipeline.hand.contact_links)
 
 
-def _suited(pipeline: Pipeline, hand: str) -> Pipeline:
-    if not pipeline.open_to_hands:
-        return pipeline
-    source = hand_source(hand)
-    return pipeline.suited(float(build_tree(read_urdf(source.urdf), source.spec).dof_free.mean()))
-
-
-def _within_reach(pipeline: Pipeline, hand: str) -> Pipeline:
-    least, asked = pipeline.bounds.min_contacts, FEWEST_CONTACTS
-    if "search" in pipeline.order:
-        search = pipeline.params("search")
-        asked = FEWEST_CONTACTS if search.usual_contacts else min(search.contacts)
-    if max(least, asked) <= FEWEST_CONTACTS:
-        return pipeline
-    source = hand_source(hand)
-    fingers, palm = build_tree(read_urdf(source.urdf), source.spec).groups, bool(source.spec.palm.links)
-    if asked > max(FEWEST_CONTACTS, fingers):
-        notice(f"hand '{source.name}': search.contacts is {max(FEWEST_CONTACTS, fingers)}, not {asked}: its fingers")
+def _within_reach(pipeline: Pipeline, source: HandSource, fingers: int) -> Pipeline:
+    search, palm = pipeline.params("search"), bool(source.spec.palm.links)
+    if not search.usual_contacts and min(search.contacts) > (most := max(FEWEST_CONTACTS, fingers)):
+        notice(f"hand '{source.name}': search.contacts is {most}, not {min(search.contacts)}: its fingers")
     if "close" in pipeline.order:  # each finger touches once
         fingers, palm = len(pipeline.steer.fingers) or fingers, palm and pipeline.steer.palm != "no"
-    most = max(FEWEST_CONTACTS, fingers + palm)
+    least, most = pipeline.bounds.min_contacts, max(FEWEST_CONTACTS, fingers + palm)
     if least <= most:
         return pipeline
     notice(f"hand '{source.name}': bounds.min_contacts is {most}, not {least}: its fingers{' and palm' * palm}")
@@ -132,9 +116,3 @@ def describe_hand(name: str) -> dict[str, Any]:
             for k, (joint, lower, upper) in enumerate(limits)
         ],
     }
-
-
-def _draft(urdf: Path, name: str) -> Path:
-    from lgrasp.hand.drafting.import_urdf import drafted_folder  # needed by few hands, and slow to load
-
-    return drafted_folder(urdf, name)

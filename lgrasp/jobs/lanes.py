@@ -5,8 +5,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events, JobOutcome, Made, Part
@@ -20,7 +19,7 @@ from lgrasp.runtime.processes import Crew, Link
 _OFTEN = 0.2  # [s] between two messages on how far a part is
 
 
-class Lanes:
+class Lanes(ExitStack):
     """Lanes for some jobs, which they begin with the first :meth:`outcome`; they end with the block.
 
     The files, and their contents, are those of one device: a lane is a task of an array in this respect.
@@ -36,17 +35,11 @@ class Lanes:
     def __init__(
         self, devices: Sequence[Device], jobs: Sequence[Request], arrays: Sequence[Array], cache: Cache, *, resume: bool
     ) -> None:
+        super().__init__()
         self._devices, self._jobs, self._arrays, self._cache, self._resume = devices, jobs, arrays, cache, resume
         self._ends: dict[int, list[JobOutcome | Exception]] = defaultdict(list)  # of each job, those of lanes
         self._told: dict[int, dict[int, _Far]] = defaultdict(dict)  # of each job, the latest of each part
         self._crew: Crew | None = None
-        self._open = ExitStack()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._open.close()
 
     def outcome(self, number: int, job: Job, events: Events) -> JobOutcome:
         """What all lanes made of the job of some number, which is ``job``; it is loaded then, for its report.
@@ -64,7 +57,7 @@ class Lanes:
             there = [part for part in todo.parts if self._resume and part.file.exists()]
             job.present(there[:1])  # another run's folder is refused at once
             outcome.seconds["kernels"] = prepare(job, todo._replace(present={part.number: 0 for part in there}))
-            crew = self._crew = self._open.enter_context(self._started())
+            crew = self._crew = self.enter_context(self._started())
         events.started(todo.parts, {})
         making = time.perf_counter()
         try:

@@ -17,9 +17,8 @@ from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ShardError
 from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.rows import METRIC_UNITS
-from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.requests.shards import MetricsRequest
-from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard
+from lgrasp.jobs.shard_inputs import arrays_of_shard, object_of_shard
 from lgrasp.object.arrays import upload_object
 from lgrasp.runtime.cores import threads
 
@@ -34,7 +33,6 @@ class MetricsJob(MetricsRequest, ShardJob):
 
     _open: ExitStack = PrivateAttr(default_factory=ExitStack)
     _each: Any = PrivateAttr(None)
-    _models: dict[str, HandArrays] = PrivateAttr(default_factory=dict)  # by hash
 
     def key(self) -> str:
         return content_key("metrics", 1, names=list(self.add), settings=list(self.settings))
@@ -74,11 +72,7 @@ class MetricsJob(MetricsRequest, ShardJob):
         if HOLD in self.add:
             first = part.rows * (kinds - 1)
             columns |= self._tried(part, workers, lambda done: progress((first + done) // kinds))
-        return Made(part.rows, (key, columns))
-
-    def write(self, part: Part, contents: Any) -> None:
-        key, columns = contents
-        self.extend(part, key, metrics=columns, units=METRIC_UNITS | METRICS)
+        return Made(part.rows, (key, {"metrics": columns, "units": METRIC_UNITS | METRICS}))
 
     def close(self) -> None:
         self._open.close()
@@ -108,20 +102,10 @@ class MetricsJob(MetricsRequest, ShardJob):
 
         assert part.source is not None
         shard, device = read_shard(part.source), self.device_used
-        if shard.hand.sha256 not in self._models:
-            model = hand_of_shard(self.cache, shard.hand, shard.header.config, device)[1]
-            self._models[shard.hand.sha256] = upload_hand(model, device.alias)
+        hand = arrays_of_shard(self.cache, shard.hand, shard.header.config, device)
         obj = upload_object(object_of_shard(self.cache, shard.objects[0], device), device.alias)
         test = self.numbers(stored_bounds(shard.header.config))[1]
-        return try_rows(
-            self._models[shard.hand.sha256],
-            obj,
-            test,
-            shard.grasps,
-            shard.header.seed,
-            workers=workers,
-            progress=progress,
-        )
+        return try_rows(hand, obj, test, shard.grasps, shard.header.seed, workers=workers, progress=progress)
 
 
 def _sets(paths: Sequence[Path]) -> list[dict[str, Any]]:

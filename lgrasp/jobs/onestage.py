@@ -77,11 +77,10 @@ def run_up_to(
     files = _stage_keys(pipeline, keys, stages, first, count, shard)
     found = {stage: arrays for stage in stages if (arrays := cache.load(stage, files[stage])) is not None}
     runs = [
-        StageRun(stage, True, json.loads(str(found[stage]["counts"])), 0.0, cache.path(stage, files[stage]))
-        for stage in stages
-        if stage in found
+        StageRun(stage, True, json.loads(str(arrays["counts"])), 0.0, cache.path(stage, files[stage]))
+        for stage, arrays in found.items()
     ]
-    done = max((i for i, stage in enumerate(stages) if stage in found), default=-1) + 1
+    done = stages.index([*found][-1]) + 1 if found else 0
     if done == len(stages):
         return runs
     inputs = load_inputs(
@@ -90,7 +89,6 @@ def run_up_to(
     context = shard_context(pipeline, inputs, shard)
     table: Any = _table(found[stages[done - 1]], used.alias) if done else (first, count)
     load_kernels(used.alias, kernel_modules(*Job.kernels))
-    runs = [run for run in runs if run.stage in stages[:done]]
     for stage in stages[done:]:
         start = time.perf_counter()
         meter = Meter(used.alias)
@@ -109,9 +107,7 @@ def _stage_keys(
     """Content key of each stage's table; it holds the key of the table before."""
     made: dict[str, str] = {}
     before = content_key("start", 1, inputs=[keys.hand, keys.object, keys.field], candidates=[first, count])
-    shared = {"bounds": pipeline.bounds.describe()} | (
-        {"steer": pipeline.steer.describe()} if pipeline.steer.asks else {}
-    )
+    shared = {name: part for name, part in pipeline.describe().items() if name in ("bounds", "steer")}
     for stage in stages:
         params = pipeline.params(stage).model_dump(mode="json") | shared
         before = made[stage] = content_key(

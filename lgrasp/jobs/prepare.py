@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.config import parse_model
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Loader, input_keys, object_key
 from lgrasp.field.params import FieldParams
@@ -20,25 +19,16 @@ from lgrasp.runtime.device import start as start_warp
 
 
 def prepare_field(
-    cache: Cache,
-    hand: str,
-    params: FieldParams,
-    *,
-    index: str | None,
-    device: str,
-    report: Callable[[str, float], None] | None,
+    cache: Cache, hand: str, params: FieldParams, *, device: str, report: Callable[[str, float], None] | None
 ) -> dict[str, Any]:
     """Build the contact field of a hand (or find it in the cache) and describe it.
 
     Args:
-        index: replaces the index structure of ``params``.
         report: called with (what, share done).
 
     Raises:
-        HandError, ConfigError, DeviceError: bad input.
+        HandError, DeviceError: bad input.
     """
-    if index is not None:
-        params = parse_model(FieldParams, params.model_dump() | {"index": index}, "--index")
     where = resolve_device(device)
     keys = input_keys(hand_source(hand), None, 1.0, ObjectParams(), params)
     start = time.perf_counter()

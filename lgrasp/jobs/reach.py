@@ -2,7 +2,7 @@
 
 import json
 import time
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -31,19 +31,16 @@ class ReachJob(ReachRequest, VerdictJob):
     version: ClassVar[int] = 3
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.hand.pairs",)
 
-    _arm: Arm | None = PrivateAttr(None)
     _solids: dict[str, "ArmSolids"] = PrivateAttr(default_factory=dict)  # by hand
 
-    @property
+    @cached_property
     def described(self) -> Arm:
         """The arm of the URDF.
 
         Raises:
             HandError: it cannot be used.
         """
-        if self._arm is None:
-            self._arm = read_arm(self.arm, self.tip, pose_matrix(self.mount.pose))
-        return self._arm
+        return read_arm(self.arm, self.tip, pose_matrix(self.mount.pose))
 
     @property
     def verdict(self) -> tuple[str, str]:
@@ -106,10 +103,6 @@ class ReachJob(ReachRequest, VerdictJob):
             cut = partial(decompose, store=self.cache)
             self._solids[hand.sha256] = ArmSolids(self.described, base_pieces(hand, cut), cut)
         return self._solids[hand.sha256]
-
-    def write(self, part: Part, contents: Any) -> None:
-        key, added = contents
-        self.extend(part, key, **added)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``arm``, ``tip``, ``joints``; ``results``: of each hand and object ``rows`` and how many of them are

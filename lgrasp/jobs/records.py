@@ -49,10 +49,7 @@ def hand_record(hand: HandModel, meshes: dict[str, bytes]) -> HandRecord:
 
 
 def object_record(
-    obj: ObjectModel,
-    id: str | None = None,
-    tables: np.ndarray | None = None,
-    steered: SteeredObject | None = None,
+    obj: ObjectModel, id: str | None = None, tables: np.ndarray | None = None, steered: SteeredObject | None = None
 ) -> ObjectRecord:
     """The object, in the user's frame, planes that it rests on, and where it must be touched; its name defaults to
     its id."""

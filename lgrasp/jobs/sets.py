@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp.config import Params
@@ -23,15 +23,12 @@ class SequenceSets(Params):
     sets: int = Field(600, ge=1, description="Different sets of objects.")
     length: int = Field(4, ge=2, le=16, description="Objects in a set.")
     permutations: int = Field(4, ge=1, description="Different orders of each set.")
-    scale: str = Field("0.06:0.10", description="Factor to metres, or range of the longest side [m].")
+    scale: str = Field(
+        "0.06:0.10", coerce_numbers_to_str=True, description="Factor to metres, or range of the longest side [m]."
+    )
     method: Method | None = Field(None, description="Replaces that of stage sequence.")
     policy: Policy | None = Field(None, description="Replaces that of stage sequence.")
     simulate: ProtocolName | None = Field(None, description="Protocol that rows must pass to be continued.")
-
-    @field_validator("scale", mode="before")
-    @classmethod
-    def _as_text(cls, value: object) -> str:
-        return str(value)
 
 
 def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list[tuple[str, ...]]:
@@ -71,8 +68,3 @@ def object_sequences(pool: Sequence[str], sets: SequenceSets, seed: int) -> list
             drawn[tuple(rng.permutation(members).tolist())] = None
         out += [tuple(pool[i] for i in order) for order in drawn]
     return out
-
-
-def sequence_name(objects: tuple[str, ...]) -> str:
-    """OBJECT-OBJECT..., for files and folders."""
-    return "-".join(Path(name).stem for name in objects)

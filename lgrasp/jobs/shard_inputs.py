@@ -18,6 +18,7 @@ from lgrasp.errors import HandError, ShardError
 from lgrasp.files import scratch_folder
 from lgrasp.grasp.hand_files import write_hand
 from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.contact_surface import PALMAR_VERSION, ContactSurface
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource, rules_of_known
@@ -78,6 +79,15 @@ def hand_of_shard(
     if source.note:
         cache.warn(f"the shard does not hold the rules of its hand '{record.name}'; taken are {source.note}")
     return _built(cache, source, device, _surface(config))
+
+
+def arrays_of_shard(cache: Cache, record: HandRecord, config: Mapping[str, Any], device: Device) -> HandArrays:
+    """The same on the device; the latest stays there."""
+
+    def make() -> HandArrays:
+        return upload_hand(hand_of_shard(cache, record, config, device)[1], device.alias)
+
+    return cache.kept.get("hand of shard", (device.alias, record.sha256, str(_surface(config))), make)
 
 
 def object_of_shard(cache: Cache, record: ObjectRecord, device: Device) -> ObjectModel:

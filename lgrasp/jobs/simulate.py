@@ -1,6 +1,7 @@
 """Simulates the rows of shards and adds the verdicts to them, or to copies."""
 
-from collections.abc import Hashable, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,11 +11,11 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from lgrasp.dataset.reader import ShardReader
+from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.errors import PhysicsError, ShardError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.jobs.kept_verdicts import GPU_BLOCK, KeptVerdicts
 from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
 from lgrasp.jobs.verdicts import VerdictJob
@@ -28,6 +29,10 @@ from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, LIFT_COLUMNS, OBJECT_COLUMNS
 
 _MIN_HOLDING_LINKS = 2  # links that it takes to hold anything
+_GPU_BLOCK = 8192  # rows of a block on a GPU, which simulates so many side by side
+_BLOCK_SECONDS = 15.0  # that a block of rows should take
+_FIRST = 8  # rows of the first block, for each thread
+_KIND, _SECONDS = "verdicts", "about"  # of the entries in the cache; member with the seconds
 
 
 class SimulateJob(SimulateRequest, VerdictJob):
@@ -38,7 +43,6 @@ class SimulateJob(SimulateRequest, VerdictJob):
 
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)
-    _scene: tuple[Hashable, Scene] | None = PrivateAttr(None)  # the latest
 
     @property
     def verdict(self) -> tuple[str, str]:
@@ -70,7 +74,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
         workers = threads(self.workers)
         with ShardReader(part.source) as reader:
             scene, rows, key = self._scene_of(reader.hand(), reader.objects()), len(reader), self.key_of(reader)
-            kept = KeptVerdicts(self.cache, key, name, largest=GPU_BLOCK if self._kind() == "gpu" else None)
+            kept = KeptVerdicts(self.cache, key, name, largest=_GPU_BLOCK if self._kind() == "gpu" else None)
 
             before = kept.rows
 
@@ -107,8 +111,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         self._kept.close()
 
     def write(self, part: Part, contents: Any) -> None:
-        kept, key, added = contents
-        self.extend(part, key, **added)
+        kept, *made = contents
+        super().write(part, made)
         kept.discard()
 
     def kept_of(self, part: Part) -> int:
@@ -150,16 +154,19 @@ class SimulateJob(SimulateRequest, VerdictJob):
 
     def _scene_of(self, hand: HandRecord, objects: Sequence[ObjectRecord]) -> Scene:
         """What is simulated of a shard: hand and objects cut into convex pieces."""
+        alias = self.device_used.alias
         planes = [b"" if record.tables is None else record.tables.tobytes() for record in objects]
-        key = (hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
-        if self._scene is None or self._scene[0] != key:
-            scene = scene_of(hand, objects, partial(decompose, store=self.cache), self.device_used.alias)
+        key = (alias, hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
+
+        def make() -> Scene:
+            scene = scene_of(hand, objects, partial(decompose, store=self.cache), alias)
             for line in (f"object {solid.name}: {note}" for solid in scene.objects for note in solid.notes):
                 if line not in self._said:
                     self._said.add(line)
                     self.cache.warn(line)
-            self._scene = key, scene
-        return self._scene[1]
+            return scene
+
+        return self.cache.kept.get("scene", key, make)
 
 
 @dataclass(frozen=True)
@@ -235,3 +242,54 @@ def _entry(group: list[Simulated], protocol: Protocol) -> dict[str, Any]:
         "per_s": simulated / seconds if seconds else None,
         "shards": [str(one.path) for one in group],
     }
+
+
+class KeptVerdicts:
+    """Columns of the first ``rows`` rows of a shard, with the seconds that they took in all runs, kept in the cache: a
+    killed simulation loses the last block of rows.
+
+    Args:
+        key: content key of the rows and of all that decides their verdicts.
+        protocol: its name, with which the columns begin.
+        largest: rows of every block; None: as many as take some seconds.
+    """
+
+    def __init__(self, cache: Cache, key: str, protocol: str, *, largest: int | None = None) -> None:
+        self._cache, self._key, self._protocol, self._largest = cache, key, protocol, largest
+        self.columns: dict[str, np.ndarray] = cache.load(_KIND, key) or {}
+        self.seconds, self.compiling = map(float, self.columns.pop(_SECONDS, (0.0, 0.0)))
+        self._begin, self._prepared = time.perf_counter(), 0.0
+
+    @property
+    def rows(self) -> int:
+        """Rows that have a verdict."""
+        return len(self.columns[f"{self._protocol}_holds"]) if self.columns else 0
+
+    @property
+    def held(self) -> int:
+        """Rows that hold."""
+        return int(self.columns[f"{self._protocol}_holds"].sum()) if self.columns else 0
+
+    def prepared(self, seconds: float) -> None:
+        """Take note of seconds in which models were made."""
+        self._prepared += seconds
+
+    def next_block(self, rows: int, threads: int) -> int:
+        """Rows to simulate next, of so many in all."""
+        rate = self.rows / self.seconds if self.seconds else 0.0
+        size = self._largest or max(int(rate * _BLOCK_SECONDS), _FIRST * threads)
+        self._begin, self._prepared = time.perf_counter(), 0.0
+        return min(size, rows - self.rows)
+
+    def add(self, found: dict[str, np.ndarray], *, last: bool) -> None:
+        """Add the columns of a block and keep all, unless it is the last."""
+        self.seconds += time.perf_counter() - self._begin - self._prepared
+        self.compiling += self._prepared
+        before = self.columns or {name: values[:0] for name, values in found.items()}
+        self.columns = {name: np.concatenate([before[name], values]) for name, values in found.items()}
+        if not last:
+            self._cache.store(_KIND, self._key, self.columns | {_SECONDS: np.array([self.seconds, self.compiling])})
+
+    def discard(self) -> None:
+        """Forget what was kept: the shard has its verdicts."""
+        self._cache.discard(_KIND, self._key)

@@ -6,6 +6,7 @@ from statistics import median
 import pytest
 from support.places import QUICK
 
+from lgrasp.bench import comparison
 from lgrasp.bench import rate as bench_module
 from lgrasp.bench.charts import draw_table
 from lgrasp.bench.comparison import (
@@ -18,11 +19,10 @@ from lgrasp.bench.comparison import (
     without_missing,
 )
 from lgrasp.bench.page import Published, load_published
-from lgrasp.bench.rate import Bench
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run
 from lgrasp.errors import ConfigError, OutputError
 from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_requests
-from lgrasp.jobs.generate import generate
 from lgrasp.picture.sheet import check_image
 
 OBJECTS = ("capsule", "mug", "box")
@@ -37,20 +37,20 @@ def runs(monkeypatch):
     seen = []
 
     def watched(job, **options):
-        outcome = generate(job, **options)
+        outcome = run(job, **options)
         seen.append((job, outcome))
         return outcome
 
-    monkeypatch.setattr(bench_module, "generate", watched)
+    monkeypatch.setattr(bench_module, "run", watched)
     return seen
 
 
-def test_yield_and_inputs_go_from_run_to_run(job, runs, known_hands):
+def test_yield_and_inputs_go_from_run_to_run(job, runs, known_hands, tmp_path):
     given = {"object": "tiny", "pipeline": load_pipeline(QUICK)}
-    with Bench() as several:
-        results = several.measure([job(**given, rows=20), job(**given, rows=10)], repeat=2)
-        count = len(runs)
-        (later,) = several.measure([job(**given, rows=5)], repeat=1)
+    shared = comparison.Cache(tmp_path), {}
+    results = bench_module.measure([job(**given, rows=20), job(**given, rows=10)], 2, *shared)
+    count = len(runs)
+    (later,) = bench_module.measure([job(**given, rows=5)], 1, *shared)
     trials = [(trial.rows, trial.rate) for trial, _ in runs[:count]]
     after = [outcome.job.measured_rate for _, outcome in runs[:count]]
     # two probes, then the jobs in turns; each begins with what the run before of the same job measured
@@ -152,16 +152,16 @@ def test_ratios(table):
     assert table["complete"]
 
 
-def test_only_the_last_pipeline_is_the_baseline(job):
+def test_only_the_last_pipeline_is_the_baseline(job, monkeypatch):
     asked = []
 
-    class Watched(Bench):
-        def measure(self, jobs, repeat, progress):
-            asked.extend(job.rows for job in jobs)
-            raise ConfigError("enough")
+    def watched(jobs, *how):
+        asked.extend(job.rows for job in jobs)
+        raise ConfigError("enough")
 
+    monkeypatch.setattr(comparison, "measure", watched)
     chosen = config(objects=("tiny",), pipelines=("swift", "robust", "lightning"), rows=50)
-    list(measure_table(Watched(), empty(chosen, 1, 5), chosen, job().cache))
+    list(measure_table(empty(chosen, 1, 5), chosen, job().cache))
     assert asked == [50, 50, 5]
 
 
@@ -225,13 +225,12 @@ def test_resume_keeps_measured_cells(table, tmp_path):
 
 
 def test_measured_cells_are_left_alone(table, job):
-    assert list(measure_table(Bench(), table, config(), job().cache)) == []
+    assert list(measure_table(table, config(), job().cache)) == []
 
 
 def test_cells_that_cannot_be_measured(job, known_hands):
     chosen = config(objects=("absent", "tiny"), pipelines=(QUICK,), rows=10)
-    with Bench() as several:
-        parts = list(measure_table(several, new_table(chosen, repeat=1, baseline_rows=1), chosen, job().cache))
+    parts = list(measure_table(new_table(chosen, repeat=1, baseline_rows=1), chosen, job().cache))
     assert [len(table["cells"]) for table, _ in parts] == [1, 2]
     absent, tiny = parts[-1][0]["cells"]
     assert "absent" in absent["error"]

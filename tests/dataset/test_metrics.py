@@ -19,8 +19,9 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run
+from lgrasp.engine.run import run as generate
 from lgrasp.errors import OutputError, ShardError
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.metrics import MetricsJob
 from lgrasp_cli.dataset import app
 

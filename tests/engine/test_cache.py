@@ -11,9 +11,10 @@ import pytest
 
 from lgrasp.config import parse_model
 from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.run import run as generate
 from lgrasp.errors import CacheError
 from lgrasp.field.params import FieldParams
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.object.params import ObjectParams
 
 ARRAYS = {"a": np.arange(40, dtype=np.float32).reshape(8, 5), "text": np.asarray("word"), "none": np.zeros((0, 3))}

@@ -5,10 +5,10 @@ import pytest
 
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.batch import run_batch
+from lgrasp.engine.run import run as generate
 from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import grasp_arrays, join_rows
-from lgrasp.jobs.generate import generate
 from lgrasp.stages.context import Context
 
 

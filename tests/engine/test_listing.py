@@ -17,7 +17,7 @@ from lgrasp.dataset.manifest import compare, read_manifest, workers
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.events import CancelledError, Events
-from lgrasp.engine.listing import renewing
+from lgrasp.engine.listing import Renewing
 from lgrasp.engine.run import run
 from lgrasp.errors import OutputError, ShardError
 
@@ -210,7 +210,7 @@ def test_two_processes_that_renew_a_file(tmp_path):
     """What the later one writes is listed, though the earlier one listed a file of the same size."""
     run(SampleJob(out=tmp_path, rows=2))
     (part,) = SampleJob(out=tmp_path, rows=2).parts()
-    with renewing([part], {}) as first, renewing([part], {}) as second:
+    with Renewing([part]).kept({}) as first, Renewing([part]).kept({}) as second:
         for number, process in enumerate((first, second)):
             data = part.file.read_bytes()
             part.file.write_bytes(data[:-1] + bytes([number]))

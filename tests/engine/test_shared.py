@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.field.params import FieldParams
 from lgrasp.grasp.records import GraspRows
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.judge.run import judge
 from lgrasp.runtime.device import resolve_device

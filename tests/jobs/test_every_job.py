@@ -20,8 +20,9 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import Job, run
+from lgrasp.engine.run import run as generate
 from lgrasp.jobs.export import ExportJob
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.learn.job import FitJob, load_predictor
 from lgrasp.jobs.metrics import MetricsJob
 from lgrasp.jobs.reach import ReachJob

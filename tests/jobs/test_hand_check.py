@@ -13,10 +13,11 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Inputs, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.find import find_hand
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hand_check.check import check_hand, check_objects
 from lgrasp.jobs.hand_check.diagnose import diagnose, field_vectors, hand_findings
 from lgrasp.object.find import find_object

@@ -12,11 +12,12 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.engine.run import run as run_job
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.hold.run import METRICS
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.metrics import MetricsJob
 
 ROWS = 20

@@ -5,9 +5,10 @@ import numpy as np
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.field.params import FieldParams
 from lgrasp.hand.find import find_hand
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.judge.run import judge
 
 

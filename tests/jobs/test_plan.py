@@ -10,6 +10,7 @@ import trimesh
 from support.jaws import mesh_record
 
 from lgrasp.cloud.read import Cloud
+from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
@@ -42,7 +43,7 @@ def plan(cache_root: Path) -> Callable[..., JobOutcome]:
             "device": "cpu",
             "cache": Cache(cache_root, pytest.fail),
         }
-        return run(PlanJob(**job | changes))
+        return run(parse_model(PlanJob, job | changes, "plan"))
 
     return plan
 
@@ -140,7 +141,7 @@ def test_without_a_plan_the_shard_is_empty_and_stays(plan, tmp_path):
     cloud = Cloud((0.8 * n).astype("f4"), n.astype("f4"), None, np.ones(len(n), bool), ())
     few = {"cloud": cloud, "starts": 2, "params": PlanParams(rolls=8, finalists=2)}
     outcome = plan(tmp_path / "out", **few)
-    assert outcome.rows == outcome.results[0]["counts"]["kept"] == 0
+    assert outcome.rows == outcome.job.report(outcome)["counts"]["kept"] == 0
     assert not validate_shard(outcome.paths[0])
     again = plan(tmp_path / "out", **few)
     assert (again.results, again.paths) == ([], outcome.paths)
@@ -161,8 +162,8 @@ def test_bad_jobs(plan, tmp_path):
     for changes, words in (
         ({}, "one of the two"),
         ({"object": "mug", "cloud": cloud}, "one of the two"),
-        ({"object": "mug", "starts": 0}, "--starts 0"),
-        ({"object": "mug", "stand_off": np.nan}, "--stand-off nan"),
+        ({"object": "mug", "starts": 0}, "'starts' = 0"),
+        ({"object": "mug", "stand_off": np.nan}, "'stand_off' = nan"),
     ):
         with pytest.raises(ConfigError, match=words):
             plan(tmp_path / "out", **changes)

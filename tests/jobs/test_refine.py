@@ -19,12 +19,13 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run
+from lgrasp.engine.run import run as generate
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.records import GraspRows, Shard
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.hold.run import METRICS
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.refine import shards
 from lgrasp.jobs.refine.shards import RefineJob, move_rows
 from lgrasp.jobs.simulate import SimulateJob

@@ -17,8 +17,9 @@ from lgrasp.engine import shard as shard_module
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.errors import ConfigError, OutputError
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 
 
 def leftovers(folder):

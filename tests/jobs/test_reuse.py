@@ -165,10 +165,9 @@ def test_passes_over_nothing(swift, context):
 
 
 def test_how_many_passes(swift, several):
-    assert swift.with_passes(None) == swift
-    assert several.with_passes(1).params("search").passes == 1
+    assert several.with_params("search", passes=1).params("search").passes == 1
     with pytest.raises(ConfigError, match="passes"):
-        swift.with_passes(65)
+        swift.with_params("search", passes=65)
 
 
 def test_a_folder_that_grows(run, several, grasps, calls, tmp_path):

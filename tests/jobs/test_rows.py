@@ -9,9 +9,10 @@ from support.places import QUICK
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.geometry.poses import pose_matrix
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.judge.run import judge
 from lgrasp.object.find import find_object
 

@@ -15,9 +15,10 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.run import run
+from lgrasp.engine.run import run as generate
 from lgrasp.errors import HandError, ShardError
 from lgrasp.grasp.records import Shard
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.refine.shards import RefineJob

@@ -10,9 +10,10 @@ from support.workers import lost
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.report import job_report
+from lgrasp.engine.run import run as generate
 from lgrasp.engine.run import run as run_job
 from lgrasp.errors import DeviceError
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 
 ROWS = 120
 _COUNTED = ("grasps", "strict", "distinct_poses", "published_count", "force_closure", "counts", "near_duplicates")

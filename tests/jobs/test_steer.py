@@ -11,13 +11,14 @@ from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.run import run as generate
 from lgrasp.engine.run import run as run_job
 from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError, PhysicsError
 from lgrasp.geometry.poses import device_matrix, pose_matrix
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.config import JobConfig, plan_requests
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.judge.run import judge

@@ -14,12 +14,13 @@ from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.engine.run import run as run_job
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.records import Shard
 from lgrasp.jobs.config import JobConfig, plan_requests
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.judge.run import judge

@@ -265,18 +265,18 @@ def table1(cli, quick, tmp_path_factory, known_hands):
 
 def test_bench_table1(table1, monkeypatch, tmp_path, tmp_path_factory):
     """It is interrupted, goes on where it was, and has nothing left to do; --set reaches what is measured."""
-    from lgrasp.bench.rate import Bench
+    from lgrasp.bench import comparison
 
-    measure = Bench.measure
+    measure = comparison.measure
 
-    def stopped(self, jobs, *more):
+    def stopped(jobs, *more):
         if jobs[0].object == "capsule":
             raise KeyboardInterrupt
-        return measure(self, jobs, *more)
+        return measure(jobs, *more)
 
     scratch = tmp_path_factory.mktemp("scratch")
     with monkeypatch.context() as patch:
-        patch.setattr(Bench, "measure", stopped)
+        patch.setattr(comparison, "measure", stopped)
         patch.setattr(tempfile, "tempdir", str(scratch))
         assert table1("--json", "t.json").code == 130
     assert not list(scratch.iterdir())

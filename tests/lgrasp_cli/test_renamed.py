@@ -5,7 +5,8 @@ import json
 import pytest
 from support.urdfs import gripper
 
-from lgrasp_cli.main import options_of, program
+from lgrasp_cli.main import program
+from lgrasp_cli.options import options_of
 from lgrasp_cli.renamed import NEW, renew
 
 
@@ -31,7 +32,7 @@ from lgrasp_cli.renamed import NEW, renew
     ],
 )
 def test_words(old, new):
-    assert renew(old.split(), options_of(old.split())) == new.split()
+    assert renew(old.split(), options_of(program(), old.split())) == new.split()
 
 
 def test_every_entry_names_options_that_commands_have():

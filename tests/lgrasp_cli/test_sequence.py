@@ -51,7 +51,7 @@ def sequence(cli, small, tmp_path):
         (["mug", "sphere", "--method", "diffuser"], "lgrasp sample MODEL"),
         (["mug", "sphere", "--scale", "0.1:0.05"], "0.06:0.10"),
         (["mug", "sphere", "--scale", "big"], "0.06:0.10"),
-        (["mug", "sphere", "-n", "0"], "at least 1"),
+        (["mug", "sphere", "-n", "0"], "'rows' = 0: Input should be greater"),
         (["mug", "sphere", "--simulate", "fcc"], "seq6"),
         (["mug", "sphere", "--simulate", "dipgrasp"], "lifts one object alone; of several choose fc, "),
         (["mug", "sphere", "box", "capsule", "bowl", "--scale", "0.05:0.06"], "take at most 4"),

@@ -24,7 +24,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import CancelledError
 from lgrasp.engine.listing import Renewing
 from lgrasp.engine.run import run
-from lgrasp.jobs import kept_verdicts, simulate
+from lgrasp.jobs import simulate
 from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.simulate.verdict import FREE_LIFT_COLUMNS
 from lgrasp_cli.progress import JobProgress
@@ -245,8 +245,8 @@ def test_verdicts_so_far_are_kept(cli, grasps, tmp_path, monkeypatch, shared_cac
     squeeze[::2] = shard.grasps.q[::2] - 0.0001
     write_shard(path, replace(shard, grasps=replace(shard.grasps, q_squeeze=squeeze)))
     assert cli("simulate", path, "--out", tmp_path / "whole").code == 0
-    monkeypatch.setattr(kept_verdicts, "_FIRST", 2)
-    monkeypatch.setattr(kept_verdicts, "_BLOCK_SECONDS", 0.0)
+    monkeypatch.setattr(simulate, "_FIRST", 2)
+    monkeypatch.setattr(simulate, "_BLOCK_SECONDS", 0.0)
     run, blocks = simulate.verdicts, []
 
     def cut(scene, rows, *more, **options):

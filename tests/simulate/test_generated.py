@@ -8,8 +8,9 @@ import pytest
 
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.run import run as generate
 from lgrasp.grasp.records import GraspRows
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import Scene, scene_of

@@ -9,8 +9,9 @@ from support.forked import fork_server
 
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.field.params import FieldParams
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 
 
 class Child:

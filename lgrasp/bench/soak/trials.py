@@ -35,10 +35,7 @@ class Place:
     def digests(self) -> dict[str, str]:
         """Of each file's contents, "" for folders, by path; of the cache only what is new, and no empty folders."""
         cached = [path for path in tree(self.cache) if (self.cache / path).is_file() and path not in self.given]
-        paths = [
-            *(path for path in tree(self.folder) if not path.startswith("cache")),
-            *(f"cache/{p}" for p in cached),
-        ]
+        paths = [*(path for path in tree(self.folder) if not path.startswith("cache")), *(f"cache/{p}" for p in cached)]
         return {path: digest(self.folder / path) for path in paths}
 
     def processes(self, session: int, patience: float) -> list[str]:
@@ -70,7 +67,7 @@ class Attack:
     moment: float
     """When, as a share of the duration of an uninterrupted run."""
     code: int = 0
-    """Exit code of the command that was ended, negative for a signal."""
+    """Exit code of the command that was ended, negative for a signal; 0: it was done before."""
     early: bool = False
     """The command line was not loaded yet."""
     seconds: float = 0.0
@@ -78,11 +75,6 @@ class Attack:
     left_at_once: list[str] = field(default_factory=list)
     """Files and folders that only the second run took away."""
     faults: list[str] = field(default_factory=list)
-
-    @property
-    def died(self) -> bool:
-        """False if the command was done before."""
-        return self.code != 0
 
 
 class Soak:
@@ -217,13 +209,7 @@ class Soak:
 
 
 def soak(
-    soak: Soak,
-    commands: Sequence[str],
-    ways: Sequence[str],
-    *,
-    rounds: int = 1,
-    hours: float = 0.0,
-    seed: int = 0,
+    soak: Soak, commands: Sequence[str], ways: Sequence[str], *, rounds: int = 1, hours: float = 0.0, seed: int = 0
 ) -> Iterator[Attack]:
     """End every command in every way, each time at another moment of its duration.
 

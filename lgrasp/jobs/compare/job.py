@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from pydantic import PrivateAttr
 
 from lgrasp.choices import ProtocolName
 from lgrasp.dataset.reader import read_shard
@@ -32,7 +32,7 @@ from lgrasp.jobs.config import pair_requests
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.metrics import HOLD, MetricsJob
-from lgrasp.jobs.requests.compare import CompareRequest, Variation
+from lgrasp.jobs.requests.compare import CompareRequest, Variation, parse_variations
 from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.object.find import all_objects
 from lgrasp.simulate.protocol import find_protocol
@@ -49,20 +49,6 @@ class ComparedHand(NamedTuple):
     of: str
     """Name of the hand that it is, or is a variant of."""
     variation: Variation | None
-
-
-def compared_hands(names: Sequence[str], variations: Sequence[Variation], cache: Cache) -> list[ComparedHand]:
-    """Each hand followed by its variants, which are written into the cache where they are missing.
-
-    Raises:
-        HandError: there is no such hand, or it cannot be varied so.
-    """
-    found = []
-    for name in all_hands(names):
-        own = hand_source(name).name
-        found.append(ComparedHand(own, name, own, None))
-        found += [_varied(name, variation, cache) for variation in variations]
-    return found
 
 
 def _varied(name: str, variation: Variation, cache: Cache) -> ComparedHand:
@@ -90,31 +76,28 @@ class CompareJob(CompareRequest, Job):
     one_key: ClassVar[bool] = False
     differs: ClassVar[str] = "other hand, object, pipeline, rows or protocol"
 
-    _hands: list[ComparedHand] | None = PrivateAttr(None)
-    _pairs: list[tuple[ComparedHand, GenerateJob]] | None = PrivateAttr(None)
-
-    @property
+    @cached_property
     def compared(self) -> list[ComparedHand]:
-        """The hands, each followed by its variants."""
-        if self._hands is None:
-            self._hands = compared_hands(self.hands, self.variations(), self.cache)
-        return self._hands
+        """The hands, each followed by its variants, which are written into the cache where they are missing.
 
-    @property
+        Raises:
+            HandError: there is no such hand, or it cannot be varied so.
+        """
+        found = []
+        for name in all_hands(self.hands):
+            own = hand_source(name).name
+            found.append(ComparedHand(own, name, own, None))
+            found += [_varied(name, variation, self.cache) for variation in parse_variations(self.vary)]
+        return found
+
+    @cached_property
     def pairs(self) -> list[tuple[ComparedHand, GenerateJob]]:
         """Each hand with each object, as the job that makes its grasps."""
-        if self._pairs is None:
-            pipeline, objects = load_pipeline(self.pipeline).with_seed(self.seed).impatient(), all_objects(self.objects)
-            how: dict[str, Any] = {
-                "rows": self.rows,
-                "shard_rows": self.rows,
-                "device": self.device,
-                "workers": self.workers,
-            }
-            sources = [hand.source for hand in self.compared]
-            jobs = [r.job(self.cache) for r in pair_requests(sources, objects, pipeline, self.out, **how)]
-            self._pairs = [(self.compared[k // len(objects)], job) for k, job in enumerate(jobs)]
-        return self._pairs
+        pipeline, objects = load_pipeline(self.pipeline).with_seed(self.seed).impatient(), all_objects(self.objects)
+        how: dict[str, Any] = {"rows": self.rows, "shard_rows": self.rows}
+        how |= {"device": self.device, "workers": self.workers}
+        requests = pair_requests([hand.source for hand in self.compared], objects, pipeline, self.out, **how)
+        return [(self.compared[k // len(objects)], r.job(self.cache)) for k, r in enumerate(requests)]
 
     def key(self) -> str:
         return content_key("compare", 1, parts=[self.part_key(part) for part in self.parts()])

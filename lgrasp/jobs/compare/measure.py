@@ -41,28 +41,17 @@ def measure_cell(path: Path, protocol: ProtocolName | None) -> dict[str, Any]:
         rows, statistics = len(reader), reader.statistics
         strict = strict_rows(reader.column, reader.header.config)
         kept = last_survivors(stage_counts(statistics))
-        wanted = ("metrics/epsilon", "metrics/unresisted_load", "metrics/hold_success")
-        columns = {name: reader.column(name).astype(float) for name in wanted if rows}
-        held = f"physics/{protocol}_holds"
-        verdicts = reader.column(held) if protocol and rows and held in reader.columns else None
-    tried, seconds = int(statistics.get("candidates", 0)), float(statistics.get("seconds_wall", 0.0))
-    share = strict / rows if rows else 0.0
-    found: dict[str, Any] = {
-        "rows": rows,
-        "yield": kept * share / tried if tried else None,
-        "strict_per_s": strict / seconds if seconds else None,
-        "approach": 0.0,
-        "surface": 0.0,
-        "contacts": None,
-        "epsilon": float(np.median(columns["metrics/epsilon"])) if rows else None,
-        "unresisted_load": float(np.median(columns["metrics/unresisted_load"])) if rows else None,
-        "hold": float(columns["metrics/hold_success"].mean()) if rows else None,
-        "simulated": float((verdicts > 0).mean()) if verdicts is not None else None,
-        "pca_ratio": None,
-        "joint_entropy": None,
-    }
-    if not rows:
-        return found
+        tried, seconds = int(statistics.get("candidates", 0)), float(statistics.get("seconds_wall", 0.0))
+        found: dict[str, Any] = {"rows": rows} | dict.fromkeys([*MEANS, "pca_ratio", "joint_entropy"])
+        found |= {"approach": 0.0, "surface": 0.0, "strict_per_s": strict / seconds if seconds else None}
+        found["yield"] = kept * (strict / rows if rows else 0.0) / tried if tried else None
+        if not rows:
+            return found
+        for name in ("epsilon", "unresisted_load"):
+            found[name] = float(np.median(reader.column(f"metrics/{name}").astype(float)))
+        found["hold"] = float(reader.column("metrics/hold_success").astype(float).mean())
+        if protocol and (held := f"physics/{protocol}_holds") in reader.columns:
+            found["simulated"] = float((reader.column(held) > 0).mean())
     numbers, _ = read_dataset([path], near=False)
     (group,) = numbers["hands"][0]["objects"]
     (cover,), (spread,) = group["coverage"].values(), group["diversity"].values()

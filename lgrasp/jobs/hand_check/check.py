@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -13,13 +14,14 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
+from lgrasp.engine.run import run
 from lgrasp.errors import HandError
 from lgrasp.files import temporary_folder, write_file
 from lgrasp.hand.fingers import finger_label
 from lgrasp.hand.opposition.facing import space_opening, space_postures
 from lgrasp.hand.opposition.spaces import hand_spaces, longest, space_sides
 from lgrasp.hand.urdf import read_urdf
-from lgrasp.jobs.generate import GenerateJob, generate
+from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hand_check.diagnose import diagnose, hand_findings
 from lgrasp.jobs.hand_check.pictures import draw_hand, draw_palmar, draw_spaces, draw_workspace
 from lgrasp.picture.sheet import image_bytes
@@ -101,30 +103,18 @@ def check_hand(
         LgraspError: the hand cannot be used, or ``out`` cannot be written.
     """
     events = events or Events()
-    cache = cache or Cache()
-    bounded = pipeline.impatient(effort=_CANDIDATES_PER_ROW)
+    how: dict[str, Any] = {"pipeline": pipeline.impatient(effort=_CANDIDATES_PER_ROW), "rows": rows, "shard_rows": rows}
     checks: list[ObjectCheck] = []
     pictures: list[Path] = []
     inputs = None
     with temporary_folder() as folder:
+        how |= {"out": folder / "grasps", "device": device, "workers": workers, "cache": cache or Cache()}
         for name, mesh in check_objects(folder).items():
             events.said(f"trying {name} of 5 cm")
-            job = GenerateJob(
-                hand=hand,
-                object=str(mesh),
-                rows=rows,
-                pipeline=bounded,
-                out=folder / "grasps",
-                device=device,
-                workers=workers,
-                shard_rows=rows,
-                cache=cache,
-            )
-            outcome = generate(job, events)
-            inputs = job.inputs
-            done = outcome.results[0]
-            reasons = diagnose(inputs, done.counts, outcome.rows, rows)
-            left = survivors(done.counts)
+            job = GenerateJob(hand=hand, object=str(mesh), **how)
+            outcome = run(job, events)
+            inputs, done = job.inputs, outcome.results[0]
+            reasons, left = diagnose(inputs, done.counts, outcome.rows, rows), survivors(done.counts)
             checks.append(ObjectCheck(name, rows, outcome.rows, done.wall, left, done.counts, reasons))
         if any(check.rows for check in checks):
             pictures.append(_draw_grasps(folder, out / "grasps.png", events))
@@ -138,8 +128,11 @@ def check_hand(
     spaces = check_spaces(inputs)
     sequence = longest_sequence(inputs, spaces)
     events.loading("pictures")
-    pictures[:0] = _draw_hand(inputs, [space.name for space in spaces if all(space.areas)], out)
-    return HandCheck(model.name, source.note, list(model.notes), hints, checks, spaces, sequence, pictures)
+    drawers = {"hand": draw_hand, "palmar": draw_palmar, "workspace": draw_workspace}
+    drawn = [draw(inputs, out / f"{name}.png") for name, draw in drawers.items()]
+    if able := [space.name for space in spaces if all(space.areas)]:
+        drawn.append(draw_spaces(inputs, able, out / "spaces.png"))
+    return HandCheck(model.name, source.note, list(model.notes), hints, checks, spaces, sequence, drawn + pictures)
 
 
 def check_spaces(inputs: Inputs) -> list[SpaceCheck]:
@@ -170,15 +163,6 @@ def longest_sequence(inputs: Inputs, checks: list[SpaceCheck]) -> int:
     able = {check.name for check in checks if not check.problem}
     spaces = [space for space in hand_spaces(inputs.keys.source.spec, tree) if space.name in able]
     return longest(spaces, (), np.zeros(len(tree.joint_names), bool))
-
-
-def _draw_hand(inputs: Inputs, spaces: list[str], out: Path) -> list[Path]:
-    pictures = [
-        draw_hand(inputs, out / "hand.png"),
-        draw_palmar(inputs, out / "palmar.png"),
-        draw_workspace(inputs, out / "workspace.png"),
-    ]
-    return [*pictures, draw_spaces(inputs, spaces, out / "spaces.png")] if spaces else pictures
 
 
 def _draw_grasps(shards: Path, path: Path, events: Events) -> Path:

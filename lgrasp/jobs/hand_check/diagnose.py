@@ -137,7 +137,8 @@ def diagnose(inputs: Inputs, counts: dict[str, dict[str, int]], rows: int, asked
     findings = hand_findings(model, inputs.field.model, dict(inputs.keys.source.spec.fingers))
     lines = [f"{s}: {line}" for s in dict.fromkeys([stage, *findings]) for line in findings.get(s, [])]
     lines += _outcomes(counts)
-    return list(dict.fromkeys([f"{stage}: {words}", *(lines or [f"{stage}: {_REMEDY[stage]}"])]))
+    remedy = [f"{stage}: {_REMEDY[stage]}"] if stage in _REMEDY else []
+    return list(dict.fromkeys([f"{stage}: {words}", *(lines or remedy)]))
 
 
 _REMEDY = {

@@ -10,11 +10,10 @@ import torch
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.errors import ConfigError
-from lgrasp.hand.digest import hand_digest
-from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.learn.network import NetworkJob, training_report
-from lgrasp.jobs.learn.sequences import ReadSteps, read_steps
+from lgrasp.jobs.learn.sequences import read_steps
 from lgrasp.jobs.requests.shards import DiffuserRequest
+from lgrasp.jobs.scenes.shards import check_hand
 from lgrasp.learn.diffuser.examples import StepExamples, make_net, unseen_objects
 from lgrasp.learn.diffuser.file import KIND, VERSION, AboutDiffuser, diffuser_bytes, load_diffuser
 from lgrasp.learn.diffuser.process import PROCESSES
@@ -33,13 +32,11 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
 
     kind: ClassVar[tuple[str, int]] = (KIND, VERSION)
 
-    @property
-    def effort_steps(self) -> int:
-        return self.params.steps
-
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, start = self.params, time.perf_counter()
-        found = self._steps()
+        found = read_steps(self.shards, self.cache, self.device_used, p.cloud)
+        check_hand(found.hand, self.hand, "the sequences")
+        self.enough(len(found.steps.t), "steps", _MIN_STEPS)
         hand, net = found.hand, make_net(found.hand, len(found.space_names), p)
         examples = StepExamples(hand.tree, found.steps, found.clouds, found.grids, net, p, self.device_used.alias)
         unseen = unseen_objects(found.meshes, p.held_out, p.seed)
@@ -49,24 +46,9 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
         read = time.perf_counter() - start
         curve = trainer.fit(lambda step, loss: progress(step, f"loss {loss:.3f}"))
         seconds = {"reading": read, "training": time.perf_counter() - start - read}
-        names = _names(found, ~unseen), _names(found, unseen)
-        report = training_report(hand.name, trainer, *names, seconds, {"drawing": curve})
+        report = training_report(hand.name, trainer, found.object_names, unseen, seconds, {"drawing": curve})
         about = AboutDiffuser(hand.name, hand.sha256, found.space_names, p, self.key(), report)
         return Made(part.rows, diffuser_bytes(trainer.kept, about))
-
-    def _steps(self) -> ReadSteps:
-        """What is learnt from.
-
-        Raises:
-            ConfigError: another hand than asked, or too few steps.
-        """
-        found = read_steps(self.shards, self.cache, self.device_used, self.params.cloud)
-        if self.hand is not None:
-            source = hand_source(self.hand)
-            if hand_digest(source.urdf, source.spec) != found.hand.sha256:
-                raise ConfigError(f"the shards are of hand '{found.hand.name}', not of '{source.name}'")
-        self.enough(len(found.steps.t), "steps", _MIN_STEPS)
-        return found
 
 
 def evaluate(
@@ -139,8 +121,3 @@ def evaluate(
         "of_data": measured(R @ examples.turns[turn], t, q),
         "seconds_per_256": seconds * 256 / min(256, len(rows)),
     }
-
-
-def _names(found: ReadSteps, which: torch.Tensor) -> list[str]:
-    """Names of some of the objects, those of several sizes once."""
-    return sorted({name for name, there in zip(found.object_names, which.tolist(), strict=True) if there})

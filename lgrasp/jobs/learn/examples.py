@@ -1,5 +1,6 @@
 """Examples for a pose policy: poses that the pipeline placed, what was seen there, and whether they gave a grasp."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -139,32 +140,37 @@ def _placed(poses: PoseTable, context: Context) -> tuple[np.ndarray, np.ndarray,
 
 def seen_reach(reach: Reach, com: np.ndarray, palm: np.ndarray) -> Seen:
     """What the network of stage place is told, with the centre of mass (P, 3) [m] and whether the palm touches (P,)."""
-    n, groups = reach.share.shape
-    hits = np.zeros((n, groups, MOST_HITS, 6), np.float32)
-    count = np.zeros((n, groups), np.int32)
-    for g in range(groups):
-        mine = reach.owner == g
-        place = np.cumsum(mine, 1) - 1
-        row, k = np.nonzero(mine & (place < MOST_HITS))
-        hits[row, g, place[row, k]] = np.concatenate([reach.points[row, k], reach.normals[row, k]], 1)
-        count[:, g] = np.minimum(mine.sum(1), MOST_HITS)
-    return Seen(hits, count, reach.share, com, palm, reach.distances)
+    mine = reach.owner[:, None] == np.arange(reach.share.shape[1])[:, None]
+    hits = _hits(mine, lambda row, g, k: (reach.points[row, k], reach.normals[row, k]))
+    return Seen(*hits, reach.share, com, palm, reach.distances)
 
 
 def seen_contacts(table: CandidateTable, context: Context) -> Seen:
     """What the network of stage domain is told of realised contacts."""
-    n = len(table)
+    n, model = len(table), context.object.model
     pose, com, palm = _placed(table.poses, context)
+    surface = to_numpy(table.surface)[:n]
     used = np.arange(table.state.shape[2]) < to_numpy(table.count)[:n, :, None]
     mine = used & (to_numpy(table.state)[:n] == State.REALISED)
+
+    def touched(row: np.ndarray, g: np.ndarray, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        i, R = surface[row, g, m], device_rotation(pose[row])
+        return R.apply(model.contact_points[i]) + pose[row, :3], -R.apply(model.contact_normals[i])
+
+    share, none = mine.sum(2) / np.float32(COUNT_SCALE), np.zeros((n, 0), np.float32)
+    return Seen(*_hits(mine, touched), share, com, palm, none)
+
+
+def _hits(
+    mine: np.ndarray, at: Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The first that are marked, (P, G, MOST_HITS, 6) points [m] and normals, and how many, (P, G).
+
+    Args:
+        mine: (P, G, K) bool. at: points and normals of the marked ones, by their indices.
+    """
     place = np.cumsum(mine, 2) - 1
-    row, g, m = np.nonzero(mine & (place < MOST_HITS))
-    i = to_numpy(table.surface)[:n][row, g, m]
-    model = context.object.model
-    hits = np.zeros((n, mine.shape[1], MOST_HITS, 6), np.float32)
-    R = device_rotation(pose[row])
-    p = R.apply(model.contact_points[i]) + pose[row, :3]
-    hits[row, g, place[row, g, m]] = np.concatenate([p, -R.apply(model.contact_normals[i])], 1)
-    count = mine.sum(2)
-    none = np.zeros((n, 0), np.float32)
-    return Seen(hits, np.minimum(count, MOST_HITS), count / np.float32(COUNT_SCALE), com, palm, none)
+    row, g, k = np.nonzero(mine & (place < MOST_HITS))
+    hits = np.zeros((*mine.shape[:2], MOST_HITS, 6), np.float32)
+    hits[row, g, place[row, g, k]] = np.concatenate(at(row, g, k), 1)
+    return hits, np.minimum(mine.sum(2), MOST_HITS)

@@ -1,30 +1,58 @@
-"""Train a one-object predictor: a network that completes views on random solids, one that draws grasps on shards."""
+"""Train a one-object predictor (a network that completes views on random solids, one that draws grasps on shards);
+what its plans are worth on the true meshes of objects, from clouds of them."""
 
 import time
-from typing import ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
+from lgrasp.cloud.model import cloud_object
+from lgrasp.dataset.writer import write_shard
+from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Made, Part, PartProgress
-from lgrasp.geometry.poses import internal_poses
+from lgrasp.engine.folder import shard_path
+from lgrasp.geometry.poses import internal_poses, user_poses
 from lgrasp.geometry.rotations import motion_from_pose
-from lgrasp.grasp.records import ObjectRecord
+from lgrasp.grasp.check import check_grasps
+from lgrasp.grasp.find_contacts import find_contacts
+from lgrasp.grasp.outcomes import Outcome
+from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader
+from lgrasp.grasp.rows import grasp_rows, press
+from lgrasp.grasp.tables import GraspTable, join_rows
+from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.hand.contact_surface import ContactSurface
+from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.learn.network import NetworkJob, training_report
+from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
+from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.requests.shards import GraspRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
+from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard, palmar_side
 from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.diffuser.examples import SequenceSteps, make_net, unseen_objects
 from lgrasp.learn.diffuser.features import mesh_centre
 from lgrasp.learn.diffuser.senses import coarse_grid
 from lgrasp.learn.diffuser.training import StepTrainer
+from lgrasp.learn.examples import seen_cloud
 from lgrasp.learn.grasp.completion import CompletionNet
 from lgrasp.learn.grasp.completion_training import ViewSet, fit_completion, solid_views
 from lgrasp.learn.grasp.examples import first_steps, grasp_examples
-from lgrasp.learn.grasp.file import KIND, VERSION, Networks, predictor_bytes
+from lgrasp.learn.grasp.file import KIND, VERSION, Networks, load_networks, predictor_bytes
 from lgrasp.learn.grasp.solids import random_solids
-from lgrasp.learn.grasp.views import draw_views
+from lgrasp.learn.grasp.views import SIDES, camera, draw_views
+from lgrasp.learn.networks import SHARDS, check_network_hand
+from lgrasp.object.arrays import upload_object
+from lgrasp.object.model import ObjectModel
+from lgrasp.planning.params import PlanParams, cloud_params
+from lgrasp.runtime.device import resolve_device
+
+KINDS = ("full", "one view")
+"""Of clouds that are measured on."""
 
 _LEAST = 64  # grasps to learn from
 
@@ -33,10 +61,7 @@ class GraspJob(GraspRequest, NetworkJob):
     """A one-object predictor; the report has the losses of both networks."""
 
     kind: ClassVar[tuple[str, int]] = (KIND, VERSION)
-
-    @property
-    def effort_steps(self) -> int:
-        return self.params.completion_steps + self.params.steps
+    steps: ClassVar[tuple[str, ...]] = ("completion_steps", "steps")
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, alias, start = self.params, self.device_used.alias, time.perf_counter()
@@ -60,9 +85,8 @@ class GraspJob(GraspRequest, NetworkJob):
         trainer = StepTrainer(draws, examples, unseen, p, alias)
         curve = trainer.fit(lambda step, loss: progress(p.completion_steps + step, f"loss {loss:.3f}"))
         seconds["training"] = time.perf_counter() - start
-        names = (_names(records, ~unseen), _names(records, unseen))
-        curves = {"completion": {"loss": completion.points}, "drawing": curve}
-        report = training_report(hand.name, trainer, *names, seconds, curves) | {"completion_loss": error}
+        names, curves = [r.name for r in records], {"completion": {"loss": completion.points}, "drawing": curve}
+        report = training_report(hand.name, trainer, names, unseen, seconds, curves) | {"completion_loss": error}
         made = Networks(trainer.kept, completes, p, hand.name, hand.sha256, self.key(), report)
         return Made(part.rows, predictor_bytes(made))
 
@@ -98,5 +122,89 @@ class GraspJob(GraspRequest, NetworkJob):
         )
 
 
-def _names(records: list[ObjectRecord], which: torch.Tensor) -> list[str]:
-    return [record.name for record, there in zip(records, which.tolist(), strict=True) if there]
+def evaluate(
+    path: Path,
+    shards: Sequence[Path],
+    cache: Cache,
+    *,
+    clouds: int = 8,
+    starts: int = 8,
+    seed: int = 1,
+    device: str = "auto",
+    out: Path | None = None,
+) -> dict[str, Any]:
+    """Plans from new clouds of the objects of shards, checked on the meshes; of each kind of cloud.
+
+    Args:
+        clouds: of each object and kind. starts: of each cloud.
+        out: folder for the plans as rows of the meshes, for the simulator, by kind.
+
+    Raises:
+        ConfigError: the file is no predictor, or of another hand than the shards.
+        LgraspError: shards cannot be used.
+    """
+    found = resolve_device(device)
+    networks, parts = load_networks(path), read_parts(shards)
+    first = next(iter(parts.values()))
+    source, hand = hand_of_shard(cache, first.hand, first.config, found)
+    check_network_hand(path, networks.hand, networks.hand_sha256, hand.name, hand.sha256, words=SHARDS)
+    touching, palmar = palmar_side(cache, source, hand, found)
+    bench = _Bench(networks, source, upload_hand(touching, found.alias), palmar, starts, cloud_params(PlanParams()))
+    begin = time.perf_counter()
+    kinds: dict[str, Any] = {kind: {} for kind in KINDS}
+    for number, (_, part) in enumerate(sorted(parts.items())):
+        model = object_of_shard(cache, part.record, found)
+        for which, kind in enumerate(KINDS):
+            rng = np.random.default_rng([seed, number, which])
+            table = join_rows([bench.plans(model, kind, rng, c) for c in range(clouds)])
+            kinds[kind][model.name] = _numbers(table, clouds * starts)
+            if out is not None:
+                bench.write(out / kind.replace(" ", "-"), model, table)
+    return {"hand": hand.name, "kinds": kinds, "seconds": time.perf_counter() - begin}
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """A predictor, and what it is measured with."""
+
+    networks: Networks
+    source: HandSource
+    hand: HandArrays
+    palmar: ContactSurface
+    starts: int
+    params: PlanParams
+
+    def plans(self, model: ObjectModel, kind: str, rng: np.random.Generator, number: int) -> GraspTable:
+        """Plans from a new cloud of a mesh as rows of it: checked there, with the control poses that were planned."""
+        points = seen_cloud(model.vertices - model.center, model.faces, camera(SIDES[kind]), rng, self.hand.device)
+        cloud = cloud_object(points.points.astype(float), points.normals)
+        planner = predicted_planner(self.networks, self.hand, cloud, self.starts, self.params, self.palmar, seed=number)
+        planned, _ = planner.run(self.starts)
+        pose = internal_poses(user_poses(planned.pose, cloud.center), np.zeros(3))
+        obj, bounds = upload_object(model, self.hand.device), self.params.bounds
+        contacts = find_contacts(self.hand, obj, pose, planned.q, bounds, self.palmar)
+        table, outcome = check_grasps(self.hand, obj, pose, planned.q, contacts, bounds)
+        table.metrics["valid"] = (outcome == Outcome.KEPT).astype(np.float32)
+        table.index[:] = number * self.starts + planned.index
+        return replace(table, q_pregrasp=planned.q_pregrasp, q_squeeze=planned.q_squeeze)
+
+    def write(self, folder: Path, model: ObjectModel, table: GraspTable) -> None:
+        """Rows of one mesh as a shard."""
+        hand = self.hand.model
+        config = {"bounds": self.params.bounds.describe(), **hand_config(self.source)}
+        header = ShardHeader(pipeline="plan", seed=0, shard_index=0, config=config)
+        record = hand_record(hand, mesh_blobs(self.source.urdf))
+        rows = grasp_rows(press(table), hand.tree, model.center)
+        shard = Shard(header=header, hand=record, objects=[object_record(model)], grasps=rows, statistics={})
+        write_shard(shard_path(folder, hand.name, model.name, 0), shard)
+
+
+def _numbers(table: GraspTable, asked: int) -> dict[str, Any]:
+    """Of the plans of one mesh."""
+    penetration = table.metrics["penetration"]
+    return {
+        "asked": asked,
+        "delivered": len(table),
+        "valid": int(table.metrics["valid"].sum()),
+        "penetration": [float(x) for x in np.quantile(penetration, (0.5, 0.9))] if len(table) else None,
+    }

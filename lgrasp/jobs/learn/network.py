@@ -1,11 +1,11 @@
 """What the jobs that train a network on shards and keep it in one file share."""
 
-from abc import abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import PrivateAttr
 
 from lgrasp.dataset.gather import gather
 from lgrasp.engine.cache import content_key
@@ -19,6 +19,8 @@ from lgrasp.jobs.requests.shards import FitRequest
 from lgrasp.learn.networks import open_network, read_card
 
 if TYPE_CHECKING:  # torch takes a second to import
+    import torch
+
     from lgrasp.learn.curve import Curves
     from lgrasp.learn.diffuser.training import StepTrainer
 
@@ -45,23 +47,19 @@ class NetworkJob(FitRequest, FileJob):
     differs: ClassVar[str] = "other shards or parameters"
     kind: ClassVar[tuple[str, int]]
     """Name and version of what is trained."""
+    steps: ClassVar[tuple[str, ...]] = ("steps",)
+    """The parameters that are its numbers of steps."""
 
-    _key: str | None = PrivateAttr(None)
+    @cached_property
+    def _rows(self) -> list[str]:
+        return [shard.value for shard in gather(self.shards, rows_digest)]
 
     def key(self) -> str:
-        if self._key is None:
-            rows = [shard.value for shard in gather(self.shards, rows_digest)]
-            described = self.params.model_dump(mode="json")
-            self._key = content_key(*self.kind, rows=rows, params=described, hand=self.hand)
-        return self._key
-
-    @property
-    @abstractmethod
-    def effort_steps(self) -> int:
-        """Steps of the training."""
+        described = self.params.model_dump(mode="json")
+        return content_key(*self.kind, rows=self._rows, params=described, hand=self.hand)
 
     def parts(self) -> list[Part]:
-        return [Part(0, self.out, self.effort_steps)]
+        return [Part(0, self.out, sum(getattr(self.params, name) for name in self.steps))]
 
     def enough(self, count: int, what: str, least: int) -> None:
         """Raises ConfigError if there are too few grasps, or what else is learnt from."""
@@ -80,21 +78,23 @@ class NetworkJob(FitRequest, FileJob):
 def training_report(
     hand: str,
     trainer: "StepTrainer",
-    objects: list[str],
-    unseen: list[str],
+    objects: Sequence[str],
+    unseen: "torch.Tensor",
     seconds: dict[str, float],
     curves: "Curves",
 ) -> dict[str, Any]:
     """What is said of a network that draws hands: what it learnt from, its losses, the time it took [s].
 
     Args:
-        unseen: objects that were held out, of ``objects`` none.
+        objects: names, those of several sizes several times.
+        unseen: which of them were held out, (O,) bool.
     """
     loss, held_out = trainer.losses()
+    kinds = list(zip(objects, unseen.tolist(), strict=True))
     return {
         "hand": hand,
-        "objects": objects,
-        "unseen": unseen,
+        "objects": sorted({name for name, held in kinds if not held}),
+        "unseen": sorted({name for name, held in kinds if held}),
         "examples": len(trainer.examples),
         "loss": loss,
         "unseen_loss": None if np.isnan(held_out) else held_out,

@@ -4,10 +4,10 @@ import math
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import PrivateAttr
 
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
@@ -51,22 +51,16 @@ class PolicyJob(PolicyRequest, FileJob):
 
     differs: ClassVar[str] = "another hand, other objects or parameters"
 
-    _keys: InputKeys | None = PrivateAttr(None)
-    _field: FieldArrays | None = PrivateAttr(None)
-    _hand: HandArrays | None = PrivateAttr(None)
-
-    @property
+    @cached_property
     def learned(self) -> Pipeline:
         """The pipeline whose grasps count, with several poses of each candidate."""
         return for_hand(self.pipeline.with_params("place", policy=None, proposals=3), self.hand)
 
-    @property
+    @cached_property
     def keys(self) -> InputKeys:
         """Content keys of hand and field."""
-        if self._keys is None:
-            source, pipeline = hand_source(self.hand), self.pipeline
-            self._keys = input_keys(source, None, 1.0, pipeline.object, pipeline.field, pipeline.hand)
-        return self._keys
+        source, pipeline = hand_source(self.hand), self.pipeline
+        return input_keys(source, None, 1.0, pipeline.object, pipeline.field, pipeline.hand)
 
     def key(self) -> str:
         params = self.learned.object
@@ -88,20 +82,22 @@ class PolicyJob(PolicyRequest, FileJob):
     def about(self) -> dict[str, Any]:
         return {"hand": self.keys.source.name, "objects": list(self.objects), "pipeline": self.pipeline.name}
 
-    def load(self, events: Events, missing: bool) -> None:
-        if not missing:
-            return
-        self.pipeline.import_stages()
-        load, alias = Loader(self.cache, self.device_used.alias, events.loading), self.device_used.alias
+    @cached_property
+    def loaded(self) -> tuple[HandArrays, FieldArrays]:
+        """Hand and field on the device."""
+        load, alias = Loader(self.cache, self.device_used.alias, self.events.loading), self.device_used.alias
         model = load.hand(self.keys.source, self.keys.hand, self.pipeline.hand)
-        self._hand = upload_hand(model, alias, self.pipeline.hand.thumb)
-        self._field = upload_field(load.field(self._hand, self.keys.field, self.pipeline.field), model, alias)
+        hand = upload_hand(model, alias, self.pipeline.hand.thumb)
+        return hand, upload_field(load.field(hand, self.keys.field, self.pipeline.field), model, alias)
+
+    def load(self, events: Events, missing: bool) -> None:
+        if missing:
+            self.pipeline.import_stages()
+            _ = self.loaded
 
     def make(self, part: Part, progress: PartProgress) -> Made:
-        assert self._hand is not None
-        assert self._field is not None
-        p, hand = self.params, self._hand.model
-        points = reach_points(self._field.model, p.seed)
+        p, hand = self.params, self.loaded[0].model
+        points = reach_points(self.loaded[1].model, p.seed)
         start = time.perf_counter()
         examples: list[PoseExamples] = []
         with ThreadPoolExecutor(self.threads()) as pool:
@@ -111,8 +107,8 @@ class PolicyJob(PolicyRequest, FileJob):
             learned = learned.with_params("place", **weights)
             for found in pool.map(lambda number: self._examples(learned, number, points), range(self.count)):
                 examples.append(found)
-                held = sum(int(e.contacts_yields.sum()) for e in examples)
-                progress((self.count + len(examples)) // 2, f"{held:,} poses gave grasps")
+                gave = sum(int(e.contacts_yields.sum()) for e in examples)
+                progress((self.count + len(examples)) // 2, f"{gave:,} poses gave grasps")
         seconds = {"examples": time.perf_counter() - start}
         order = np.random.default_rng(p.seed).permutation(self.count)
         held = max(1, round(p.held_out * self.count))
@@ -166,10 +162,8 @@ class PolicyJob(PolicyRequest, FileJob):
 
     def _context(self, learned: Pipeline, number: int) -> Context:
         """In which an object is searched."""
-        assert self._hand is not None
-        assert self._field is not None
-        alias = self.device_used.alias
-        parts = self._hand, upload_object(self._object(number), alias), self._field, alias, self.params.seed, number
+        alias, (hand, field) = self.device_used.alias, self.loaded
+        parts = hand, upload_object(self._object(number), alias), field, alias, self.params.seed, number
         return Context(*parts, bounds=learned.bounds, realised=learned.realised)
 
     def _object(self, number: int) -> ObjectModel:

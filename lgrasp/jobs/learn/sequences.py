@@ -13,7 +13,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import internal_poses
 from lgrasp.geometry.rotations import motion_from_pose
-from lgrasp.grasp.records import ObjectRecord
+from lgrasp.grasp.records import ObjectRecord, padded
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.scenes.shards import check_finite, mesh_objects
 from lgrasp.jobs.shard_inputs import hand_of_shard
@@ -68,7 +68,7 @@ def read_steps(paths: Paths, cache: Cache, device: Device, cloud: int) -> ReadSt
         _, hand = hand_of_shard(cache, reader.hand(), reader.header.config, device)
     numbers: dict[tuple[str, float], int] = {}
     clouds, grids, names, meshes, parts = [], [], [], [], []
-    slots = max(part.value.columns["object_index"].shape[1] for part in shards)
+    slots = max(2, *(part.value.columns["object_index"].shape[1] for part in shards))
     for _, _, part in shards:
         own = []
         for record in part.objects:
@@ -104,22 +104,20 @@ def _steps(
 
     Args:
         objects: number of each object of the shard, and its centre in the user's frame [m].
-        slots: objects of a row at most, in any shard.
+        slots: objects of a row at most, in any shard, and 2 at least.
     """
-    index, free_joints = columns["object_index"], columns["sequence/free_joints"][..., : hand.dofs]
-    rows, width = np.arange(len(index)), index.shape[1]
-    last = (index >= 0).sum(1) - 1
+    index, given_pose = padded(columns["object_index"], (slots,)), padded(columns["object_pose"], (slots, 7))
+    free_joints = padded(columns["sequence/free_joints"][..., : hand.dofs], (slots, hand.dofs))
+    rows, last = np.arange(len(index)), (index >= 0).sum(1) - 1
     free = free_joints[rows, last]
-    before = np.arange(width) < last[:, None]  # (N, O)
+    before = np.arange(slots) < last[:, None]  # (N, O)
     used = (free_joints & before[..., None]).any(1)
-    pose = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (len(index), width, 1))
+    pose = np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (len(index), slots, 1))
     for number, (_, centre) in enumerate(objects):
         own = index == number
-        pose[own] = internal_poses(columns["object_pose"][own], centre)
+        pose[own] = internal_poses(given_pose[own], centre)
     R, t = motion_from_pose(torch.as_tensor(pose))
     known = np.array([*(number for number, _ in objects), -1])[index]
-    held = np.full((len(index), max(slots - 1, 1)), -1)
-    held[:, : width - 1] = np.where(before, known, -1)[:, : held.shape[1]][:, : width - 1]
     q = columns["q"][:, : hand.dofs]
     arrays: dict[str, Any] = {
         "q": q,
@@ -128,11 +126,8 @@ def _steps(
         "free": free,
         "space": columns["sequence/space"][rows, last].astype(np.int64),
         "object": known[rows, last],
-        "held": held,
+        "held": np.where(before, known, -1)[:, :-1],
     }
     moved = torch.as_tensor(rows), torch.as_tensor(last)
-    pad = held.shape[1] - min(width, held.shape[1])
-    held_rotation = torch.nn.functional.pad(R[:, : held.shape[1]], (0, 0, 0, 0, 0, pad))
-    held_position = torch.nn.functional.pad(t[:, : held.shape[1]], (0, 0, 0, pad))
     given = {name: torch.as_tensor(np.ascontiguousarray(values)) for name, values in arrays.items()}
-    return SequenceSteps(R=R[moved], t=t[moved], held_rotation=held_rotation, held_position=held_position, **given)
+    return SequenceSteps(R=R[moved], t=t[moved], held_rotation=R[:, :-1], held_position=t[:, :-1], **given)

@@ -1,6 +1,7 @@
 """The job of ``lgrasp plan``: a hand before an object or a cloud -> one shard of grasps."""
 
 import time
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -51,8 +52,6 @@ class PlanJob(PlanRequest, Job):
 
     cloud: Path | InstanceOf[Cloud] | None = None
     _cloud: Cloud | None = PrivateAttr(None)
-    _found: tuple[HandSource, HandModel, ObjectModel, ObjectModel | None] | None = PrivateAttr(None)
-    _networks: Networks | None = PrivateAttr(None)
 
     @property
     def name(self) -> str:
@@ -60,42 +59,34 @@ class PlanJob(PlanRequest, Job):
 
     @property
     def folder(self) -> Path:
-        source, _, model, _ = self._models()
+        source, _, model, _ = self._models
         return self.out or Path("plans") / f"{source.name}-{model.name}"
 
     def key(self) -> str:
-        _, hand, model, around = self._models()
+        _, hand, model, around = self._models
         record = self._record()
         normals = None if record.normals is None else np.asarray(record.normals, np.float32).tobytes().hex()
         rest = None if around is None else np.asarray(around.contact_points, np.float32).tobytes().hex()
-        return content_key(
-            "plan",
-            VERSION,
-            hand=hand.sha256,
-            object=[model.name, mesh_hash(record), normals, rest],
-            starts=self.starts,
-            stand_off=self._stand_off(),
-            params=self._params().model_dump(mode="json"),
-            keep_invalid=self.keep_invalid,
-            **self._model_key(),
-        )
+        told = self._told() | {"params": self._params().model_dump(mode="json"), "keep_invalid": self.keep_invalid}
+        seen = [model.name, mesh_hash(record), normals, rest]
+        return content_key("plan", VERSION, hand=hand.sha256, object=seen, **told)
 
     def parts(self) -> list[Part]:
-        source, _, model, _ = self._models()
+        source, _, model, _ = self._models
         return [Part(0, shard_path(self.folder, source.name, model.name, 0), self.starts)]
 
     def about(self) -> dict[str, Any]:
-        source, _, model, _ = self._models()
+        source, _, model, _ = self._models
         return {"hand": source.name, "objects": [model.name]}
 
     def gave_up(self, rows: int, found: Found) -> bool:
         return found.tried >= rows
 
     def make(self, part: Part, progress: PartProgress) -> Made:
-        source, hand, model, around = self._models()
+        source, hand, model, around = self._models
         touching, palmar = palmar_side(self.cache, source, hand, self.device_used)
         plan, arrays = self._params(), upload_hand(touching, self.device_used.alias)
-        begin, networks = time.perf_counter(), self.networks()
+        begin, networks = time.perf_counter(), self.networks
         if networks is None:
             planner = Planner(arrays, model, self._stand_off(), plan, palmar, around)
         else:
@@ -104,60 +95,53 @@ class PlanJob(PlanRequest, Job):
             self.starts, lambda done, plans: progress(done, f"{plans:,} plans"), keep_invalid=self.keep_invalid
         )
         seconds = time.perf_counter() - begin
-        header = ShardHeader(
-            pipeline="plan",
-            seed=0,
-            shard_index=0,
-            config={
-                "run_key": self.key(),
-                "bounds": planner.effort.bounds.describe(),
-                "plan": self._params().model_dump(mode="json"),
-                "starts": self.starts,
-                "stand_off": self._stand_off(),
-                **hand_config(source),
-                **self._model_key(),
-            },
-        )
+        config = {
+            "run_key": self.key(),
+            "bounds": planner.effort.bounds.describe(),
+            "plan": plan.model_dump(mode="json"),
+        }
+        config |= self._told() | hand_config(source)
+        header = ShardHeader(pipeline="plan", seed=0, shard_index=0, config=config)
         statistics = {
             "device": self.device_used.name,
             "seconds_wall": seconds,
             "candidates": self.starts,
             "exhausted": 1,
-            **{_statistic(name): n for name, n in counts.items()},
+            **{f"plan_{name.replace(' ', '_').replace('-', '_')}": n for name, n in counts.items()},
         }
         rows = grasp_rows(press(grasps), hand.tree, model.center)
         record = hand_record(hand, mesh_blobs(source.urdf))
         shard = Shard(header=header, hand=record, objects=[self._record()], grasps=rows, statistics=statistics)
-        return Made(len(rows), shard, {"counts": counts, "seconds": seconds})
+        return Made(len(rows), shard, seconds)
 
+    @cached_property
     def networks(self) -> Networks | None:
         """What draws the hands to start from, if something does.
 
         Raises:
             ConfigError: the file is none, or of another hand.
         """
-        if self.model is not None and self._networks is None:
-            path, (source, hand, _, _) = find_network(self.model), self._models()
-            self._networks = load_networks(path)
-            check_network_hand(path, self._networks.hand, self._networks.hand_sha256, source.name, hand.sha256)
-        return self._networks
+        if self.model is None:
+            return None
+        path, (source, hand, _, _) = find_network(self.model), self._models
+        found = load_networks(path)
+        check_network_hand(path, found.hand, found.hand_sha256, source.name, hand.sha256)
+        return found
 
-    def _model_key(self) -> dict[str, Any]:
-        if self.networks() is None:
-            return {}
-        return {"network": network_key(find_network(str(self.model)))}
+    def _told(self) -> dict[str, Any]:
+        """What keys and shards tell of the starts."""
+        told = {"starts": self.starts, "stand_off": self._stand_off()}
+        return told | ({"network": network_key(find_network(str(self.model)))} if self.networks else {})
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``grasps``, ``starts``, ``points`` (the object is a cloud), ``counts`` (what became of the starts), medians
         of ``epsilon`` and ``unresisted_load``, ``seconds_planning``, ``force_closure`` (share), ``valid`` by the bounds
         of ``profile``."""
-        _, hand, model, _ = self._models()
+        _, hand, model, _ = self._models
         data: dict[str, Any] = {"hand": hand.name, "object": model.name, "starts": self.starts, "grasps": outcome.rows}
-        data["points"] = self.cloud is not None
-        data |= {"profile": self.params.bounds.profile, "force_closure": closure_share(outcome.paths)}
-        data |= {"counts": {}, "seconds_planning": 0.0, "epsilon": None, "unresisted_load": None, "valid": 0}
-        for result in outcome.results:
-            data |= {"counts": result["counts"], "seconds_planning": result["seconds"]}
+        data |= {"points": self.cloud is not None, "profile": self.params.bounds.profile}
+        data |= {"force_closure": closure_share(outcome.paths), "seconds_planning": sum(outcome.results)}
+        data |= {"counts": {}, "epsilon": None, "unresisted_load": None, "valid": 0}
         for path in outcome.paths:
             with ShardReader(path) as reader:
                 statistics = reader.statistics
@@ -179,39 +163,29 @@ class PlanJob(PlanRequest, Job):
         return self.params if self.cloud is None else cloud_params(self.params)
 
     def _stand_off(self) -> float:
-        return self.stand_off or self._models()[0].spec.stand_off or STAND_OFF
+        return self.stand_off or self._models[0].spec.stand_off or STAND_OFF
 
+    @cached_property
     def _models(self) -> tuple[HandSource, HandModel, ObjectModel, ObjectModel | None]:
         """The hand, what is grasped, and what stands around it."""
-        if self._found is None:
-            source, hand = named_hand(self.cache, self.hand, self.device_used)
-            around = None
-            if self.cloud is not None:
-                self._cloud = self._read(self.cloud)
-                model, around = _cloud_models(self._cloud, self.name)
-            else:
-                assert self.object is not None
-                model = named_object(self.cache, self.object, self.scale, self.device_used)
-            self._found = source, hand, model, around
-        return self._found
-
-    def _read(self, cloud: Path | Cloud) -> Cloud:
+        source, hand = named_hand(self.cache, self.hand, self.device_used)
+        if self.cloud is None:
+            assert self.object is not None
+            return source, hand, named_object(self.cache, self.object, self.scale, self.device_used), None
+        cloud = self.cloud
         if isinstance(cloud, Path):
             cloud = cloud_to_grasp(self.cache, cloud, self.mask, self.label, self.scale, self.viewpoint)
-        return cloud
+        self._cloud = cloud
+        return source, hand, *_cloud_models(cloud, self.name)
 
     def _record(self) -> ObjectRecord:
-        record = object_record(self._models()[2])
+        record = object_record(self._models[2])
         return record if self._cloud is None else cloud_record(record, self._cloud)
 
 
 def lost_starts(counts: dict[str, int]) -> str:
     """Outcomes of the starts that gave no plan, in words."""
     return ", ".join(f"{n} {what}" for what, n in counts.items() if what not in ("starts", "kept") and n)
-
-
-def _statistic(name: str) -> str:
-    return f"plan_{name.replace(' ', '_').replace('-', '_')}"
 
 
 def _cloud_models(cloud: Cloud, name: str) -> tuple[ObjectModel, ObjectModel | None]:

@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,17 +20,18 @@ from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
+from lgrasp.engine.run import Job
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import HandError, ShardError
 from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader, now
-from lgrasp.hand.arrays import HandArrays, upload_hand
+from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs
 from lgrasp.jobs.refine.moved import move_rows
 from lgrasp.jobs.requests.shards import RefineRequest
-from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, object_of_shard
+from lgrasp.jobs.shard_inputs import arrays_of_shard, named_hand, object_of_shard
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.load import load_mesh
 from lgrasp.steer.touch import moved_rows
@@ -43,8 +45,8 @@ class RefineJob(RefineRequest, ShardJob):
 
     command: ClassVar[str] = "refine"
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.refine.", "lgrasp.grasp.")
+    write = Job.write  # of whole shards
 
-    _models: dict[str, HandArrays] = PrivateAttr(default_factory=dict)  # by hash
     _given: dict[int, Shard] = PrivateAttr(default_factory=dict)  # of an export, by number of the part
 
     def key(self) -> str:
@@ -70,9 +72,7 @@ class RefineJob(RefineRequest, ShardJob):
 
     def _parts_of_export(self, form: str) -> list[Part]:
         """Grasps in the format of another program: a part of each object and scale, those of one name numbered."""
-        assert self.hand is not None
-        source, model = named_hand(self.cache, self.hand, self.device_used)
-        self._models[model.sha256] = upload_hand(model, self.device_used.alias)
+        source, model = self._named
         self._given = dict(enumerate(_grasp_shards(self.shards[0], form, source, model)))
         self._hands, self._objects = {model.name}, {shard.objects[0].id for shard in self._given.values()}
         parts, named = [], Counter[Path]()
@@ -150,23 +150,23 @@ class RefineJob(RefineRequest, ShardJob):
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         """``results``: of each shard hand, object, ``points`` (it is a cloud), rows, refined, valid before and after,
         mean energies, seconds; ``force_closure`` (share)."""
-        return {
-            "results": [_entry(path) for path in outcome.paths],
-            "force_closure": closure_share(outcome.paths),
-        }
+        return {"results": [_entry(path) for path in outcome.paths], "force_closure": closure_share(outcome.paths)}
+
+    @cached_property
+    def _named(self) -> tuple[HandSource, HandModel]:
+        """The hand of the option."""
+        assert self.hand is not None
+        return named_hand(self.cache, self.hand, self.device_used)
 
     def _hand(self, path: Path, shard: Shard) -> HandArrays:
         """The hand of a shard, whatever is installed under its name; ``hand`` is only compared with it."""
-        digest, device = shard.hand.sha256, self.device_used
-        if digest not in self._models:
-            if self.hand is not None and (named := named_hand(self.cache, self.hand, device)[1]).sha256 != digest:
-                raise HandError(
-                    f"{path}: its grasps are of hand '{shard.hand.name}' (hash {digest[:12]}), not of '{named.name}' "
-                    f"(hash {named.sha256[:12]}); leave --hand out, the hand is in the shard"
-                )
-            _, model = hand_of_shard(self.cache, shard.hand, shard.header.config, device)
-            self._models[digest] = upload_hand(model, device.alias)
-        return self._models[digest]
+        digest = shard.hand.sha256
+        if self.hand is not None and (named := self._named[1]).sha256 != digest:
+            raise HandError(
+                f"{path}: its grasps are of hand '{shard.hand.name}' (hash {digest[:12]}), not of '{named.name}' "
+                f"(hash {named.sha256[:12]}); leave --hand out, the hand is in the shard"
+            )
+        return arrays_of_shard(self.cache, shard.hand, shard.header.config, self.device_used)
 
 
 def _entry(path: Path) -> dict[str, Any]:

@@ -39,17 +39,16 @@ class CompareRequest(Request):
 
     hands: HandNames
     objects: tuple[str, ...] = Field(
-        default=("bottle", "box", "capsule", "mug"), min_length=1, description="Names, paths, folders, or globs."
+        ("bottle", "box", "capsule", "mug"), min_length=1, description="Names, paths, folders, or globs."
     )
-    rows: int = Field(default=200, ge=1, description="Grasps per hand and object.")
+    rows: int = Field(200, ge=1, description="Grasps per hand and object.")
     vary: tuple[str, ...] = Field(
-        default=(),
-        description="KIND:VALUES, a variant of each hand per value; kinds: joint_limit, link_scale, finger_spacing.",
+        (), description="KIND:VALUES, a variant of each hand per value; kinds: joint_limit, link_scale, finger_spacing."
     )
-    simulate: ProtocolName | None = Field(default=None, description="Protocol by which grasps are simulated.")
-    pipeline: str = Field(default="robust", description="Name or path.")
+    simulate: ProtocolName | None = Field(None, description="Protocol by which grasps are simulated.")
+    pipeline: str = Field("robust", description="Name or path.")
     seed: OtherSeed = None
-    out: Path = Field(default=Path("compare"), description="Folder for the folders HAND-OBJECT/PIPELINE and the page.")
+    out: Path = Field(Path("compare"), description="Folder for the folders HAND-OBJECT/PIPELINE and the page.")
 
     @field_validator("vary", mode="before")
     @classmethod
@@ -61,7 +60,7 @@ class CompareRequest(Request):
         return " ".join(Path(name).stem for name in (*self.hands, *self.objects))
 
     def check(self) -> None:
-        self.variations()
+        parse_variations(self.vary)
         for name in all_hands(self.hands):
             hand_path(name)
         for name in all_objects(self.objects):
@@ -69,14 +68,6 @@ class CompareRequest(Request):
         if load_pipeline(self.pipeline).sequence is not None:
             raise ConfigError(f"pipeline '{self.pipeline}' is for several objects; choose one that generates grasps")
         check_folder(self.out)
-
-    def variations(self) -> list[Variation]:
-        """The variants of each hand.
-
-        Raises:
-            ConfigError: an unknown kind, or a factor out of range.
-        """
-        return parse_variations(self.vary)
 
 
 def parse_variations(texts: Sequence[str]) -> list[Variation]:

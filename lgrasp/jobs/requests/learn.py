@@ -22,11 +22,11 @@ class PolicyRequest(Request):
     unit: ClassVar[str] = "objects"
 
     hand: HandName = "allegro"
-    objects: tuple[str, ...] = Field(default=(), description="Names or mesh files to learn from; none: random shapes.")
+    objects: tuple[str, ...] = Field((), description="Names or mesh files to learn from; none: random shapes.")
     scale: MeshScale = 1.0
     pipeline: NamedPipeline = Field(default_factory=lambda: load_pipeline("robust"))
-    out: Path = Field(default=Path("policy.npz"), description="File of the policy.")
-    params: PosePolicyParams = Field(default_factory=lambda: PosePolicyParams.model_validate({}))
+    out: Path = Field(Path("policy.npz"), description="File of the policy.")
+    params: PosePolicyParams = Field(default_factory=PosePolicyParams)
 
     def check(self) -> None:
         if self.out.is_dir():

@@ -18,8 +18,6 @@ from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
 from lgrasp.planning.params import PlanParams
 
-_MAX_BASE_DISTANCE = 1.0  # [m] of a base from a start
-
 
 class PlanRequest(Request):
     """Plans of grasps of an object or of a cloud: one shard of those that passed every check, a row a start."""
@@ -28,27 +26,25 @@ class PlanRequest(Request):
     unit: ClassVar[str] = "starts"
 
     hand: str = Field(
-        default="allegro", description="Name, path, or a shard (its hand); default: the model's hand, else allegro."
+        "allegro", description="Name, path, or a shard (its hand); default: the model's hand, else allegro."
     )
-    out: Path | None = Field(default=None, description="Folder of the plans; default: plans/HAND-OBJECT.")
-    starts: int = Field(default=80, description="Points of the surface to start from.")
-    object: str | None = Field(default=None, description="Name, mesh file, or a shard of one object.")
-    scale: float = Field(default=1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
-    cloud: Path | None = Field(default=None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene.")
-    mask: Path | None = Field(default=None, description="Labels of the cloud's points (.npy, .npz).")
-    label: int | None = Field(default=None, description="Label of the points to grasp.")
+    out: Path | None = Field(None, description="Folder of the plans; default: plans/HAND-OBJECT.")
+    starts: int = Field(80, ge=1, description="Points of the surface to start from.")
+    object: str | None = Field(None, description="Name, mesh file, or a shard of one object.")
+    scale: float = Field(1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
+    cloud: Path | None = Field(None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene.")
+    mask: Path | None = Field(None, description="Labels of the cloud's points (.npy, .npz).")
+    label: int | None = Field(None, description="Label of the points to grasp.")
     viewpoint: Viewpoint = None
     model: str | None = Field(
-        default=None,
+        None,
         description="File of lgrasp learn fit --model grasp, or a name of lgrasp learn list, that draws hands to start "
         "from.",
     )
     stand_off: float | None = Field(
-        default=None, description="Of the hand's base from a start [m]; default: the hand's."
+        None, gt=0, le=1, description="Of the hand's base from a start [m]; default: the hand's."
     )
-    keep_invalid: bool = Field(
-        default=False, description="The best of a start is kept where it fails too, metric valid 0."
-    )
+    keep_invalid: bool = Field(False, description="The best of a start is kept where it fails too, metric valid 0.")
     params: PlanParams = Field(default_factory=PlanParams)
 
     @model_validator(mode="before")
@@ -73,12 +69,6 @@ class PlanRequest(Request):
             raise ConfigError("give --object (a mesh or a name) or --cloud (a file of points), one of the two")
         if self.cloud is None and not (self.mask is self.label is self.viewpoint is None):
             raise ConfigError("--mask, --label and --viewpoint belong to --cloud")
-        if self.starts < 1:
-            raise ConfigError(f"--starts {self.starts}: at least 1")
-        if self.stand_off is not None and not 0 < self.stand_off <= _MAX_BASE_DISTANCE:
-            raise ConfigError(
-                f"--stand-off {self.stand_off:g}: more than 0 and at most {_MAX_BASE_DISTANCE:g} m is accepted"
-            )
         if not self.params.distal + self.params.other > 0:
             raise ConfigError("--distal 0 --other 0: nothing pulls the hand to the object; give one of them a weight")
         look_up(self.hand, hand_path)

@@ -24,17 +24,17 @@ class SceneRequest(Request):
     unit: ClassVar[str] = "scenes"
     part: ClassVar[str] = "scene"
 
-    hand: str | None = Field(default=None, description="Name or path; default: that of the grasps, else allegro.")
-    objects: tuple[str, ...] = Field(default=(), description="Names or paths; default: all objects of the grasps.")
+    hand: str | None = Field(None, description="Name or path; default: that of the grasps, else allegro.")
+    objects: tuple[str, ...] = Field((), description="Names or paths; default: all objects of the grasps.")
     scale: MeshScale = 1.0
-    grasps: Path | None = Field(default=None, description="Folder of shards; default: grasps are generated.")
-    pipeline: str = Field(default="robust", description="Generates grasps where no folder of them is given.")
-    stock: int = Field(default=1000, ge=1, description="Grasps that are generated of each object.")
-    scenes: int = Field(default=100, ge=1)
+    grasps: Path | None = Field(None, description="Folder of shards; default: grasps are generated.")
+    pipeline: str = Field("robust", description="Generates grasps where no folder of them is given.")
+    stock: int = Field(1000, ge=1, description="Grasps that are generated of each object.")
+    scenes: int = Field(100, ge=1)
     seed: Seed = 0
-    out: Path = Field(default=Path("scenes"), description="Folder of the scenes.")
-    workers: int = Field(default=0, ge=0, description="Scenes made at once; 0: one a core.")
-    scene: SceneParams = Field(default_factory=lambda: SceneParams.model_validate({}))
+    out: Path = Field(Path("scenes"), description="Folder of the scenes.")
+    workers: int = Field(0, ge=0, description="Scenes made at once; 0: one a core.")
+    scene: SceneParams = Field(default_factory=SceneParams)
 
     @property
     def known_parts(self) -> int:

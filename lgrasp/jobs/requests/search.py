@@ -1,21 +1,20 @@
 """What is asked of the jobs that search grasps by a pipeline."""
 
-import math
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from pydantic import Field, ValidationInfo, model_validator
 
 from lgrasp.choices import Method, Policy, ProtocolName
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
 from lgrasp.config import HandName, Negatives, OtherSeed, Params, ShardFolder, Viewpoint, parse_model
-from lgrasp.engine.folder import check_number
+from lgrasp.engine.folder import check_number, run_folder
 from lgrasp.engine.pipeline import NamedPipeline, Pipeline
-from lgrasp.engine.request import Request
+from lgrasp.engine.request import Request, named
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
-from lgrasp.hand.names import hand_path
+from lgrasp.hand.names import hand_path, known_hands
 from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
 from lgrasp.paths import check_file
@@ -23,24 +22,37 @@ from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import NO_TABLE, PROTOCOLS, find_protocol
 
 
+def hand_name(hand: str) -> str:
+    """What a hand is called in the names of folders.
+
+    Raises:
+        HandError: there is no such hand.
+    """
+    if hand in known_hands():  # one of the catalogue is called by its folder
+        return hand
+    hand_path(hand)
+    return named("lgrasp.jobs.hands:hand_source")(hand).name  # slow to load: only for what is there
+
+
+def sequence_name(objects: tuple[str, ...]) -> str:
+    """OBJECT-OBJECT..., for files and folders."""
+    return "-".join(Path(name).stem for name in objects)
+
+
 class SearchRequest(Request):
     """Shards of grasps by one hand, perhaps of fewer rows than requested."""
 
     hand: HandName = "allegro"
-    rows: int = Field(default=1000, description="Rows requested.")
+    rows: int = Field(1000, ge=1, description="Rows requested.")
     pipeline: NamedPipeline
     out: ShardFolder
-    shard_rows: int = Field(default=10_000, description="Rows of a shard; part of what decides the rows.")
+    shard_rows: int = Field(10_000, ge=1, description="Rows of a shard; part of what decides the rows.")
 
     @property
     def known_parts(self) -> int:
         return -(-self.rows // self.shard_rows)
 
     def check(self) -> None:
-        if self.rows <= 0:
-            raise ConfigError(f"-n {self.rows}: request at least 1")
-        if self.shard_rows <= 0:
-            raise ConfigError(f"--shard-rows {self.shard_rows}: must be at least 1")
         check_number(self.known_parts, "shards; use larger --shard-rows or several --out")
         for what, asked in {"place.table": self.pipeline.on_table, "steer": self.pipeline.steer.asks}.items():
             if asked and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
@@ -62,20 +74,21 @@ class GenerateRequest(SearchRequest):
     maker: ClassVar[str] = "lgrasp.jobs.generate:GenerateJob"
 
     object: str = Field(description="Name or mesh file.")
-    scale: float = Field(default=1.0, gt=0, description="Factor from the mesh's unit to metres.")
-    batch: int = Field(default=0, description="Candidates per batch; 0: as suits the device.")
+    scale: float = Field(1.0, gt=0, description="Factor from the mesh's unit to metres.")
+    batch: int = Field(0, ge=0, description="Candidates per batch; 0: as suits the device.")
     negatives: Negatives = 0.0
-    rate: float = Field(default=1.0, description="Rows expected per candidate by the first shard; never changes rows.")
+    rate: float = Field(
+        1.0,
+        gt=0,
+        allow_inf_nan=False,
+        description="Rows expected per candidate by the first shard; never changes rows.",
+    )
 
     @property
     def title(self) -> str:
         return f"{Path(self.hand).stem} {Path(self.object).stem} {self.pipeline.name}"
 
     def check(self) -> None:
-        if self.batch < 0:
-            raise ConfigError(f"--batch {self.batch}: must be at least 0 (0: by device)")
-        if not 0 < self.rate < math.inf:
-            raise ConfigError(f"rate {self.rate}: the rows expected per candidate must be positive and finite")
         if self.pipeline.sequence is not None:
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}' is for several objects: lgrasp sequence OBJECT OBJECT ..."
@@ -114,29 +127,35 @@ class SequenceRequest(SearchRequest):
     maker: ClassVar[str] = "lgrasp.jobs.sequence.job:SequenceJob"
     unit: ClassVar[str] = "sequences"
 
-    objects: tuple[str, ...] = Field(
-        default=(), description="Names or mesh files, in the order in which they are grasped."
-    )
-    rows: int = Field(default=256, description="Complete sequences requested.")
+    objects: tuple[str, ...] = Field((), description="Names or mesh files, in the order in which they are grasped.")
+    rows: int = Field(256, ge=1, description="Complete sequences requested.")
+    out: ShardFolder = Field(Path(), description="Default: grasps/HAND-OBJECT-OBJECT.../PIPELINE.")
     scale: str = Field(
-        default="1",
+        "1",
         coerce_numbers_to_str=True,
         description="Factor to metres, or range of the longest side [m] such as 0.06:0.10.",
     )
     simulate: ProtocolName | None = Field(
-        default=None, description="Protocol that the rows of every step must pass to be continued."
+        None, description="Protocol that the rows of every step must pass to be continued."
     )
-    shard_rows: int = Field(default=1000, description="Sequences of a shard; part of what decides the rows.")
+    shard_rows: int = Field(1000, ge=1, description="Sequences of a shard; part of what decides the rows.")
 
     @model_validator(mode="before")
     @classmethod
     def _choose(cls, asked: Any, info: ValidationInfo) -> Any:
-        if not isinstance(asked, dict) or isinstance(asked.get("pipeline"), Pipeline):
+        if not isinstance(asked, dict):
             return asked
         own, where = SequencePipeline.model_fields, (info.context or {}).get("where", cls.usual)
         chosen = {"pipeline": cls.usual} | {name: value for name, value in asked.items() if name in own}
         made = parse_model(SequencePipeline, chosen, where).made()
         return {name: value for name, value in asked.items() if name not in own} | {"pipeline": made}
+
+    @model_validator(mode="after")
+    def _usual_folder(self) -> Self:
+        if "out" not in self.model_fields_set:
+            named = hand_name(self.hand), sequence_name(self.names)
+            self.out = run_folder(Path("grasps"), *named, self.pipeline.name, self.simulate)
+        return self
 
     @property
     def title(self) -> str:
@@ -180,10 +199,10 @@ class SampleRequest(SequenceRequest):
 
     model: str = Field(description="File of lgrasp learn fit --model diffuser, or a name of lgrasp learn list.")
     clouds: tuple[Path, ...] = Field(
-        default=(), description="Point clouds (.ply .xyz .npy .npz .h5) in place of objects, in their order."
+        (), description="Point clouds (.ply .xyz .npy .npz .h5) in place of objects, in their order."
     )
-    masks: tuple[Path, ...] = Field(default=(), description="Labels of each cloud's points (.npy, .npz).")
-    labels: tuple[int, ...] = Field(default=(), description="Label of the points to grasp in each cloud.")
+    masks: tuple[Path, ...] = Field((), description="Labels of each cloud's points (.npy, .npz).")
+    labels: tuple[int, ...] = Field((), description="Label of the points to grasp in each cloud.")
     viewpoint: Viewpoint = None
 
     @model_validator(mode="before")

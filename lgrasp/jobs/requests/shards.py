@@ -33,7 +33,7 @@ Format = Annotated[FormatName, BeforeValidator(lambda name: name.replace("_", "-
 class VerdictRequest(ShardRequest):
     """Verdicts, added to shards, in place or to copies."""
 
-    out: Path | None = Field(default=None, description="Folder of copies; default: the shards get the verdicts.")
+    out: Path | None = Field(None, description="Folder of copies; default: the shards get the verdicts.")
 
     @property
     def folder(self) -> Path:
@@ -53,11 +53,9 @@ class SimulateRequest(VerdictRequest):
     maker: ClassVar[str] = "lgrasp.jobs.simulate:SimulateJob"
 
     protocol: Protocol = Field(default_factory=lambda: find_protocol("fc"), description="Named protocol.")
-    engine: EngineName | None = Field(default=None, description="Simulator; default: the protocol's, MuJoCo.")
+    engine: EngineName | None = Field(None, description="Simulator; default: the protocol's, MuJoCo.")
     device: DeviceName = "cpu"
-    all_directions: bool = Field(
-        default=False, description="Go on after the first direction in which an object is lost."
-    )
+    all_directions: bool = Field(False, description="Go on after the first direction in which an object is lost.")
 
     @field_validator("protocol", mode="before")
     @classmethod
@@ -77,12 +75,12 @@ class ReachRequest(VerdictRequest):
     maker: ClassVar[str] = "lgrasp.jobs.reach:ReachJob"
 
     arm: Path = Field(description="URDF of the arm.")
-    tip: str | None = Field(default=None, description="Link that carries the hand; default: the arm's last one.")
-    mount: Placement = Field(default=ORIGIN, description="Pose of the hand's base link in the tip's frame.")
+    tip: str | None = Field(None, description="Link that carries the hand; default: the arm's last one.")
+    mount: Placement = Field(ORIGIN, description="Pose of the hand's base link in the tip's frame.")
     at: Placement = Field(
         description="Object's frame, or of grasps on a table the place on it, in the frame of the arm's root link."
     )
-    tries: int = Field(default=32, ge=1, le=4096, description="Postures of the arm from which a pose is searched.")
+    tries: int = Field(32, ge=1, le=4096, description="Postures of the arm from which a pose is searched.")
     device: DeviceName = "cpu"
 
     def check(self) -> None:
@@ -100,7 +98,7 @@ class MetricsRequest(ShardRequest):
 
     add: tuple[MetricName, ...] = Field(min_length=1, description="Metrics: volume, epsilon_exact, hold (three).")
     settings: tuple[str, ...] = Field(
-        default=(),
+        (),
         description="PART.KEY=VALUE each: bounds, in place of what the rows passed, or hold, in place of its defaults.",
     )
 
@@ -127,14 +125,12 @@ class RefineRequest(ShardRequest):
     maker: ClassVar[str] = "lgrasp.jobs.refine.shards:RefineJob"
 
     shards: tuple[Path, ...] = Field(description="Shards, folders of them at any depth; or one export, see 'form'.")
-    form: Format | None = Field(default=None, description="Format of another program; none: shards.")
-    hand: str | None = Field(default=None, description="Of grasps in another format; shards hold their own.")
-    keep_invalid: bool = Field(
-        default=False, description="Rows that pass in no posture are kept too, with metric valid 0."
-    )
+    form: Format | None = Field(None, description="Format of another program; none: shards.")
+    hand: str | None = Field(None, description="Of grasps in another format; shards hold their own.")
+    keep_invalid: bool = Field(False, description="Rows that pass in no posture are kept too, with metric valid 0.")
     params: RefineParams = Field(default_factory=RefineParams)
-    bounds: GraspBounds | None = Field(default=None, description="None: those that the rows of a shard passed before.")
-    settings: tuple[str, ...] = Field(default=(), description="PART.KEY=VALUE of bounds or refine, in place of theirs.")
+    bounds: GraspBounds | None = Field(None, description="None: those that the rows of a shard passed before.")
+    settings: tuple[str, ...] = Field((), description="PART.KEY=VALUE of bounds or refine, in place of theirs.")
 
     def check(self) -> None:
         self.numbers(GraspBounds())
@@ -173,9 +169,9 @@ class FitRequest(Request):
     unit: ClassVar[str] = "steps"
 
     shards: ShardPaths
-    out: Path = Field(default=Path("coarse.pt"), description="File of the predictor.")
-    params: LearnParams = Field(default_factory=lambda: LearnParams.model_validate({}))
-    hand: str | None = Field(default=None, description="Default: that of the shards.")
+    out: Path = Field(Path("coarse.pt"), description="File of the predictor.")
+    params: LearnParams = Field(default_factory=LearnParams)
+    hand: str | None = Field(None, description="Default: that of the shards.")
 
     def check(self) -> None:
         if self.out.is_dir():
@@ -192,8 +188,8 @@ class DiffuserRequest(FitRequest):
 
     maker: ClassVar[str] = "lgrasp.jobs.learn.diffuser:DiffuserJob"
 
-    out: Path = Field(default=Path("diffuser.pt"), description="File of the network.")
-    params: DiffuserParams = Field(default_factory=lambda: DiffuserParams.model_validate({}))
+    out: Path = Field(Path("diffuser.pt"), description="File of the network.")
+    params: DiffuserParams = Field(default_factory=DiffuserParams)
 
 
 class GraspRequest(FitRequest):
@@ -201,8 +197,8 @@ class GraspRequest(FitRequest):
 
     maker: ClassVar[str] = "lgrasp.jobs.learn.grasp:GraspJob"
 
-    out: Path = Field(default=Path("grasp.pt"), description="File of the networks.")
-    params: GraspParams = Field(default_factory=lambda: GraspParams.model_validate({}))
+    out: Path = Field(Path("grasp.pt"), description="File of the networks.")
+    params: GraspParams = Field(default_factory=GraspParams)
 
 
 class ExportRequest(Request):
@@ -213,12 +209,12 @@ class ExportRequest(Request):
     shards: ShardPaths
     to: Format = Field(description="Name of the format.")
     out: Path = Field(description="Folder to write; it must be empty or not exist yet.")
-    limit: int | None = Field(default=None, ge=1, description="Most grasps.")
+    limit: int | None = Field(None, ge=1, description="Most grasps.")
     where: tuple[str, ...] = Field(
-        default=(), description="Only rows of which these are true, such as 'metrics/epsilon > 0.01'."
+        (), description="Only rows of which these are true, such as 'metrics/epsilon > 0.01'."
     )
-    split: Path | None = Field(default=None, description="File of dataset split; its parts become files (webdataset).")
-    licence: str = Field(default="", description="SPDX identifier; adds a card, provenance and checksums.")
+    split: Path | None = Field(None, description="File of dataset split; its parts become files (webdataset).")
+    licence: str = Field("", description="SPDX identifier; adds a card, provenance and checksums.")
 
     def check(self) -> None:
         check_options(self.to, self.split, self.licence)

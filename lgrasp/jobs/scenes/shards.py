@@ -112,12 +112,18 @@ def load_hand(
         HandError, ShardError: see :func:`hand_of_shard`.
     """
     part = next(iter(parts))
-    if name is not None:
-        source = hand_source(name)
-        digest = hand_digest(source.urdf, source.spec)
-        if part.hand.sha256 != digest:
-            raise ConfigError(
-                f"the grasps of '{part.record.id}' are of hand '{part.hand.name}' (hash {part.hand.sha256[:12]}), "
-                f"not of '{source.name}' (hash {digest[:12]}); leave the hand out, or generate them with this one"
-            )
+    check_hand(part.hand, name, f"the grasps of '{part.record.id}'")
     return hand_of_shard(cache, part.hand, part.config, device)[1], part.hand
+
+
+def check_hand(hand: HandRecord | HandModel, name: str | None, what: str) -> None:
+    """Raises ConfigError where ``what``, which is of a hand, is asked for of another one."""
+    if name is None:
+        return
+    source = hand_source(name)
+    digest = hand_digest(source.urdf, source.spec)
+    if hand.sha256 != digest:
+        raise ConfigError(
+            f"{what} are of hand '{hand.name}' (hash {hand.sha256[:12]}), not of '{source.name}' "
+            f"(hash {digest[:12]}); leave the hand out, or generate them with this one"
+        )

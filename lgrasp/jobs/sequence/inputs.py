@@ -1,7 +1,5 @@
 """Inputs of a job of sequences: a hand, its view by opposition spaces with a field, the objects."""
 
-import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lgrasp.engine.cache import Cache, content_key
+from lgrasp.engine.cache import Cache, content_key, json_digest
 from lgrasp.engine.inputs import Loader, Report, object_key
 from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
@@ -53,8 +51,7 @@ class SequenceKeys:
 
     def run_key(self, pipeline: dict[str, Any], shard_rows: int, simulate: str | None) -> str:
         """Content key of a run: everything that decides its rows."""
-        parts = [pipeline, self.hand, self.field, self.objects, shard_rows, simulate]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+        return json_digest([pipeline, self.hand, self.field, self.objects, shard_rows, simulate])
 
 
 @dataclass(frozen=True)

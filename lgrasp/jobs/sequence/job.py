@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,13 +16,12 @@ from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.bottleneck import starving_stage
-from lgrasp.jobs.requests.search import SequenceRequest
+from lgrasp.jobs.requests.search import SequenceRequest, sequence_name
 from lgrasp.jobs.search import SearchJob
 from lgrasp.jobs.sequence.inputs import SequenceInputs, SequenceKeys, load_sequence_inputs, sequence_keys
 from lgrasp.jobs.sequence.records import object_records, sequence_rows
 from lgrasp.jobs.sequence.round import Steps, Verdicts, add_steps
 from lgrasp.jobs.sequence.shard import SequenceResult, make_sequences, most_rounds
-from lgrasp.jobs.sets import sequence_name
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.cores import cores
 from lgrasp.runtime.kept import Keeper
@@ -44,13 +44,11 @@ class SequenceJob(SequenceRequest, SearchJob):
     def protocol(self) -> str | None:
         return self.simulate
 
-    @property
+    @cached_property
     def keys(self) -> SequenceKeys:
         """Content keys of hand, views, fields and objects."""
-        if self._keys is None:
-            pipeline, size = self.pipeline, parse_size(self.scale)
-            self._keys = sequence_keys(self.hand, self.objects, size, pipeline.seed, pipeline.object, pipeline.field)
-        return self._keys
+        pipeline, size = self.pipeline, parse_size(self.scale)
+        return sequence_keys(self.hand, self.objects, size, pipeline.seed, pipeline.object, pipeline.field)
 
     @property
     def object_hashes(self) -> set[str] | None:
@@ -66,17 +64,8 @@ class SequenceJob(SequenceRequest, SearchJob):
         return found.tried >= most_rounds(self.pipeline, rows)
 
     def load_inputs(self, events: Events) -> SequenceInputs:
-        pipeline = self.pipeline
-        inputs = load_sequence_inputs(
-            self.cache,
-            self.keys,
-            pipeline.object,
-            pipeline.field,
-            self.device_used,
-            events.loading,
-            self.clouds_by_key(),
-        )
-        return self.with_sampler(inputs)
+        what = self.keys, self.pipeline.object, self.pipeline.field, self.device_used, events.loading
+        return self.with_sampler(load_sequence_inputs(self.cache, *what, self.clouds_by_key()))
 
     def clouds_by_key(self) -> dict[str, Callable[[], ObjectModel]]:
         """What makes the objects that are point clouds."""

@@ -102,40 +102,38 @@ def run_round(
     return result
 
 
+@dataclass
 class _Step:
     """Grasps of the next object for some sequences, wave by wave of candidates, until each has enough."""
 
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        inputs: SequenceInputs,
-        rows: SequenceTable,
-        seed: int,
-        pool: ThreadPoolExecutor,
-        result: Round,
-        tell: Callable[[float], None],
-    ) -> None:
-        self._pipeline, self._inputs, self._rows, self._seed = pipeline, inputs, rows, seed
-        self._pool, self._result, self._tell = pool, result, tell
-        self._params = pipeline.params("sequence")
-        self._have = np.zeros(len(rows), int)
-        self._found: list[GraspTable] = []
-        self._tried: list[np.ndarray] = []  # row * spaces + space of what was continued
+    pipeline: Pipeline
+    inputs: SequenceInputs
+    rows: SequenceTable
+    seed: int
+    pool: ThreadPoolExecutor
+    result: Round
+    tell: Callable[[float], None]
+
+    def __post_init__(self) -> None:
+        self.params = self.pipeline.params("sequence")
+        self.have = np.zeros(len(self.rows), int)
+        self.found: list[GraspTable] = []
+        self.tried: list[np.ndarray] = []  # row * spaces + space of what was continued
 
     def run(self) -> SequenceTable:
         """The rows that are one object longer, by the row that they extend."""
-        rows, params = self._rows, self._params
-        left = len(self._inputs.objects) - rows.steps - 1
-        order = space_orders(rows, self._inputs.spaces, params.policy, left, self._seed)
+        rows, params = self.rows, self.params
+        left = len(self.inputs.objects) - rows.steps - 1
+        order = space_orders(rows, self.inputs.spaces, params.policy, left, self.seed)
         if not params.in_waves:
             self._one_each(order[:, 0])
         for wave in range(params.waves if params.in_waves else 0):
-            self._tell((rows.steps + wave / params.waves) / len(self._inputs.objects))
+            self.tell((rows.steps + wave / params.waves) / len(self.inputs.objects))
             space = order[np.arange(len(rows)), wave % np.maximum((order >= 0).sum(1), 1)]
             chosen = np.flatnonzero((space >= 0) & self._wanting)
             if len(chosen):
                 self._go_on(chosen, space[chosen], wave)
-        if not self._tried:
+        if not self.tried:
             return take_rows(rows, np.zeros(0, int))
         table = self._longer()
         return take_rows(table, go_on(table.parent, table.metrics["room"], params))
@@ -143,13 +141,13 @@ class _Step:
     @property
     def _wanting(self) -> np.ndarray:
         """Rows that have not enough grasps yet, (N,) bool."""
-        return self._have < self._params.branch * (_LOOKAHEAD_CHOICES if self._params.policy == "lookahead" else 1)
+        return self.have < self.params.branch * (_LOOKAHEAD_CHOICES if self.params.policy == "lookahead" else 1)
 
     def _go_on(self, chosen: np.ndarray, space: np.ndarray, wave: int) -> None:
         """Give some rows a wave of candidates with their spaces."""
-        size, view = self._params.wave, self._inputs.view
-        context = self._context(chosen, space, size, stage_seed(self._seed, self._rows.steps, "wave", wave))
-        if self._params.method == "diffuser":
+        size, view = self.params.wave, self.inputs.view
+        context = self._context(chosen, space, size, stage_seed(self.seed, self.rows.steps, "wave", wave))
+        if self.params.method == "diffuser":
             drawn = self._drawn(chosen, context.held, size, wave)
             predicted = upload_predicted(view.hand, context.object, context.held, view.records, *drawn)
             context = context.changed(predicted=predicted)
@@ -158,37 +156,37 @@ class _Step:
 
     def _drawn(self, chosen: np.ndarray, held: HeldArrays, each: int, wave: int) -> "DrawnSteps":
         """Poses and postures of ``each`` candidates of some rows with their spaces, drawn at once by the network."""
-        inputs, before = self._inputs, take_rows(self._rows, chosen)
+        inputs, before = self.inputs, take_rows(self.rows, chosen)
         assert inputs.sampler is not None
         assert held.space is not None
         start = time.perf_counter()
         hands = HeldHands(before.posture(inputs.hand.tree), before.used, before.pose)
-        seed = stage_seed(self._seed, before.steps, "diffuser", wave)
-        how: dict[str, Any] = {"each": each, "seed": seed, "steps": self._params.draws, "pool": self._pool}
+        seed = stage_seed(self.seed, before.steps, "diffuser", wave)
+        how: dict[str, Any] = {"each": each, "seed": seed, "steps": self.params.draws, "pool": self.pool}
         drawn = inputs.sampler.draw(hands, held.space, held.free, **how)
-        add_seconds(self._result.seconds, {"diffuser": time.perf_counter() - start})
+        add_seconds(self.result.seconds, {"diffuser": time.perf_counter() - start})
         return drawn
 
     def _one_each(self, space: np.ndarray) -> None:
         """One grasp of each row with its space, by the optimiser or as the network draws it."""
-        able, view = np.flatnonzero(space >= 0), self._inputs.view
+        able, view = np.flatnonzero(space >= 0), self.inputs.view
         if not len(able):
             return
-        context = self._context(able, space[able], 1, self._seed)
-        if self._params.method == "diffuser":
+        context = self._context(able, space[able], 1, self.seed)
+        if self.params.method == "diffuser":
             drawn = self._drawn(able, context.held, 1, 0)
             found = upload_predicted(view.hand, context.object, context.held, view.records, *drawn).struct
             grasps = TouchingGrasps(*drawn, *fetch([found.hand_point, found.object_point]))
         else:
             grasps = self._optimised(able, context.held)
         meter = Meter(context.device)
-        table = run_stage("filter", touching_sets(grasps, context), self._pipeline, context, meter)
+        table = run_stage("filter", touching_sets(grasps, context), self.pipeline, context, meter)
         self._take(table, [meter], able, space[able], 1, 0)
 
     def _optimised(self, able: np.ndarray, held: HeldArrays) -> "Optimised":
         from lgrasp.sequence.optimiser.optimise import optimise  # torch
 
-        inputs, rows, params = self._inputs, self._rows, self._params
+        inputs, rows, params = self.inputs, self.rows, self.params
         assert held.space is not None
         start = time.perf_counter()
         grasps = optimise(
@@ -199,12 +197,12 @@ class _Step:
             q=rows.posture(inputs.hand.tree)[able],
             free=held.free,
             held=rows.pose[able],
-            seed=np.array([stage_seed(self._seed, rows.steps, params.method, int(i)) for i in able]),
+            seed=np.array([stage_seed(self.seed, rows.steps, params.method, int(i)) for i in able]),
             params=params.optimiser,
             method=params.method,
             device=inputs.device.alias,
         )
-        add_seconds(self._result.seconds, {params.method: time.perf_counter() - start})
+        add_seconds(self.result.seconds, {params.method: time.perf_counter() - start})
         return grasps
 
     def _take(
@@ -212,30 +210,30 @@ class _Step:
     ) -> None:
         """Keep grasps by candidates that continue ``chosen`` rows, ``size`` each, after ``before`` others."""
         for meter in meters:
-            self._result.count(meter.counts, meter.seconds)
-        row, tries, pair = grasps.index // size, self._params.tries, chosen * len(self._inputs.spaces) + space
-        self._found.append(replace(grasps, index=pair[row] * tries + before + grasps.index % size))
-        self._tried.append(pair)
-        self._have += np.bincount(chosen[row], minlength=len(self._rows))
+            self.result.count(meter.counts, meter.seconds)
+        row, tries, pair = grasps.index // size, self.params.tries, chosen * len(self.inputs.spaces) + space
+        self.found.append(replace(grasps, index=pair[row] * tries + before + grasps.index % size))
+        self.tried.append(pair)
+        self.have += np.bincount(chosen[row], minlength=len(self.rows))
 
     def _longer(self) -> SequenceTable:
         """The sequences that are continued, by row and space; their candidates are numbered over all rows."""
-        tries, spaces = self._params.tries, self._inputs.spaces
-        pairs, grasps = np.unique(np.concatenate(self._tried)), join_rows(self._found)
+        tries, spaces = self.params.tries, self.inputs.spaces
+        pairs, grasps = np.unique(np.concatenate(self.tried)), join_rows(self.found)
         rows, space = np.divmod(pairs, len(spaces))
         grasps = take_rows(grasps, np.argsort(grasps.index, kind="stable"))
         place = np.searchsorted(pairs, grasps.index // tries) * tries + grasps.index % tries
-        context, before = self._context(rows, space, tries, self._seed), take_rows(self._rows, rows)
-        table, counts = grow((before, replace(grasps, index=place)), self._params, context)
+        context, before = self._context(rows, space, tries, self.seed), take_rows(self.rows, rows)
+        table, counts = grow((before, replace(grasps, index=place)), self.params, context)
         for number, found in counts.items():
-            self._result.count({"sequence": found})
-            add_counts(self._result.spaces[-1], {spaces[number].name: found})
+            self.result.count({"sequence": found})
+            add_counts(self.result.spaces[-1], {spaces[number].name: found})
         parent = rows[table.parent]
         return replace(table, parent=parent, candidate=parent * tries + table.candidate % tries)
 
     def _context(self, chosen: np.ndarray, space: np.ndarray, tries: int, seed: int) -> Context:
         """Input of the stages that continue chosen rows with opposition spaces."""
-        inputs, before = self._inputs, take_rows(self._rows, chosen)
+        inputs, before = self.inputs, take_rows(self.rows, chosen)
         view, step, posture = inputs.view, before.steps, before.posture(inputs.hand.tree)
         held = inputs.objects[:step], before.pose
         return Context(
@@ -245,9 +243,9 @@ class _Step:
             inputs.device.alias,
             seed,
             0,
-            self._pipeline.bounds,
+            self.pipeline.bounds,
             holding=hold(view.hand, posture, before.used, *held, tries=tries, spaces=inputs.spaces, space=space),
-            realised=self._pipeline.realised,
+            realised=self.pipeline.realised,
         )
 
     def _from_stages(self, context: Context, candidates: int) -> tuple[GraspTable, list[Meter]]:
@@ -257,9 +255,9 @@ class _Step:
 
         def run(number: int) -> GraspTable:
             first, meter = number * size, meters[number]
-            return run_stages(self._pipeline, context, first, min(size, candidates - first), "filter", meter)
+            return run_stages(self.pipeline, context, first, min(size, candidates - first), "filter", meter)
 
-        return join_rows(list(self._pool.map(run, range(len(meters))))), meters
+        return join_rows(list(self.pool.map(run, range(len(meters))))), meters
 
 
 def _that_hold(

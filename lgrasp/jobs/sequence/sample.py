@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -38,53 +38,51 @@ class SampleJob(SampleRequest, SequenceJob):
 
     command: ClassVar[str] = "sample"
 
-    _network: tuple[DiffuserNet, AboutDiffuser, str] | None = PrivateAttr(None)
     _clouds: dict[str, Cloud] = PrivateAttr(default_factory=dict)  # by key
 
+    @cached_property
     def network(self) -> tuple[DiffuserNet, AboutDiffuser, str]:
         """The network, what its file says, and the content of the file as a key.
 
         Raises:
             ConfigError: the file is none, or of another hand.
         """
-        if self._network is None:
-            path, source = find_network(self.model), self.keys.source
-            net, about = load_diffuser(path)
-            same_spaces = about.space_names == tuple(source.spec.opposition_spaces)
-            digest = hand_digest(source.urdf, source.spec) if same_spaces else ""
-            check_network_hand(path, about.hand, about.hand_sha256, source.name, digest)
-            self._network = net, about, network_key(path)
-        return self._network
+        path, source = find_network(self.model), self.keys.source
+        net, about = load_diffuser(path)
+        same_spaces = about.space_names == tuple(source.spec.opposition_spaces)
+        digest = hand_digest(source.urdf, source.spec) if same_spaces else ""
+        check_network_hand(path, about.hand, about.hand_sha256, source.name, digest)
+        return net, about, network_key(path)
 
-    @property
+    @cached_property
     def keys(self) -> SequenceKeys:
-        if self._keys is None and self.clouds:
-            scale = parse_size(self.scale).low
-            read = [cloud_to_grasp(self.cache, *target, scale, self.viewpoint) for target in self.targets]
-            how = network_key(find_network(_COMPLETES)), self.pipeline.object
-            keys = [cloud_key(cloud, name, *how) for cloud, name in zip(read, self.names, strict=True)]
-            self._clouds = dict(zip(keys, read, strict=True))
-            about = {"names": self.names, "meshes": self.clouds, "scales": (scale,) * len(read), "objects": tuple(keys)}
-            self._keys = replace(super().keys, **about)
-        return super().keys
+        if not self.clouds:
+            return super().keys
+        scale = parse_size(self.scale).low
+        read = [cloud_to_grasp(self.cache, *target, scale, self.viewpoint) for target in self.targets]
+        how = network_key(find_network(_COMPLETES)), self.pipeline.object
+        keys = [cloud_key(cloud, name, *how) for cloud, name in zip(read, self.names, strict=True)]
+        self._clouds = dict(zip(keys, read, strict=True))
+        about = {"names": self.names, "meshes": self.clouds, "scales": (scale,) * len(read), "objects": tuple(keys)}
+        return replace(super().keys, **about)
 
     @property
     def object_hashes(self) -> set[str] | None:
         return None if self.clouds else super().object_hashes
 
     def key(self) -> str:
-        return content_key("sample", 2, run=super().key(), network=self.network()[2])
+        return content_key("sample", 2, run=super().key(), network=self.network[2])
 
     def own_config(self) -> dict[str, Any]:
-        own = {"model": find_network(self.model).name, "network": self.network()[2]}
+        own = {"model": find_network(self.model).name, "network": self.network[2]}
         return super().own_config() | own | ({"completed_by": _COMPLETES} if self.clouds else {})
 
     def parts(self) -> list[Part]:
-        self.network()  # told at once if it cannot be used
+        _ = self.network  # told at once if it cannot be used
         return super().parts()
 
     def with_sampler(self, inputs: SequenceInputs) -> SequenceInputs:
-        net, about, _ = self.network()
+        net, about, _ = self.network
         models, alias = [obj.model for obj in inputs.objects], inputs.device.alias
         clouds, grids = zip(*(_seen(model, about.params.cloud, alias) for model in models), strict=True)
         sampler = StepSampler(inputs.hand.tree, net, about.params.process, clouds, grids, alias)

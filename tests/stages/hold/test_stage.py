@@ -9,11 +9,11 @@ from lgrasp.config import parse_model
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.engine.run import run as generate
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.tables import GraspTable, grasp_arrays, take_grasps
 from lgrasp.hold.run import METRICS
-from lgrasp.jobs.generate import generate
 from lgrasp.jobs.requests.shards import RefineRequest
 from lgrasp.judge.run import judge
 from lgrasp.stages.context import Context

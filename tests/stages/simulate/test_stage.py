@@ -11,9 +11,9 @@ from lgrasp.dataset.info import stage_counts
 from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.run import run as generate
 from lgrasp.errors import ConfigError, OutputError, PhysicsError
 from lgrasp.grasp.tables import GraspTable, grasp_arrays
-from lgrasp.jobs.generate import generate
 from lgrasp.jobs.records import make_scene, mesh_blobs, object_record
 from lgrasp.simulate.protocol import PROTOCOLS, find_protocol
 from lgrasp.simulate.run import check_installed, verdicts
