@@ -38,8 +38,8 @@ from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_lig
 from lgrasp.grasp.stability_kernels import find_stable_squeeze
 from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.contact_surface import palm_axis
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.palm import palm_axis
 from lgrasp.math.constants import LOAD_DIRECTIONS
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays

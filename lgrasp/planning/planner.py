@@ -16,8 +16,7 @@ from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import NOT_HELD, REASONS, Outcome, bounds_squeeze, failed_bounds
 from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps, take_rows
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.contact_surface import ContactSurface
-from lgrasp.hand.palm import palm_axis
+from lgrasp.hand.contact_surface import ContactSurface, palm_axis
 from lgrasp.hold.params import HoldTest
 from lgrasp.hold.run import METRICS, ControlPoses, HoldTester
 from lgrasp.object.arrays import ObjectArrays, upload_object

@@ -9,7 +9,7 @@ from lgrasp.differentiable.solids import HandPoints, hand_solids
 from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_matrix, device_rotation
 from lgrasp.hand.arrays import HandArrays, body_poses
-from lgrasp.hand.palm import palm_axis
+from lgrasp.hand.contact_surface import palm_axis
 from lgrasp.hand.tree import Tree
 from lgrasp.math.lanes import LANES, lanes_of
 from lgrasp.math.scratch import empty_rows
