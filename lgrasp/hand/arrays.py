@@ -18,7 +18,7 @@ from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import sdf_part
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.fetch import to_numpy
-from lgrasp.runtime.structs import upload_struct
+from lgrasp.runtime.structs import on_device, upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -224,30 +224,38 @@ def overlap_grid(c: Overlaps, i: wp.int32):
 @wp.kernel
 def place_bodies(
     h: Kinematics,
+    pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
     # out
-    pose_out: wp.array2d(dtype=wp.transform),
+    body_out: wp.array2d(dtype=wp.transform),
 ):
-    """Bodies of postures in the base frame; launched over postures.
+    """Bodies of hands in some frame; launched over hands.
 
     Args:
+        pose: T_frame_base, (N,); or (0,): the frame is that of the base.
         q: [rad or m], (N, K).
-        pose_out: T_base_body, (N, B).
+        body_out: T_frame_body, (N, B).
     """
     row = wp.tid()
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    pose_out[row, 0] = wp.transform_identity()
+    T = wp.transform_identity()
+    if pose.shape[0] > 0:
+        T = pose[row]
+    body_out[row, 0] = T
     for g in range(h.groups):
         first = group_forward(h, g, group_dofs(h, g, q, row), X, 0)
         for j in range(h.joint_first[g + 1] - first):
-            pose_out[row, 1 + first + j] = X[j]
+            if pose.shape[0] > 0:
+                body_out[row, 1 + first + j] = T * X[j]
+            else:
+                body_out[row, 1 + first + j] = X[j]
 
 
 def body_poses(hand: HandArrays, q: np.ndarray) -> np.ndarray:
     """T_base_body of every body as device poses (N, B, 7) for postures q (N, K)."""
     q = np.ascontiguousarray(q, np.float32)
-    bodies = len(hand.model.tree.joint_dof) + 1
-    out = wp.empty((len(q), bodies), dtype=wp.transform, device=hand.device)
-    queries = wp.array(q, dtype=wp.float32, device=hand.device)
-    wp.launch(place_bodies, dim=len(q), inputs=[hand.struct.kin, queries], outputs=[out], device=hand.device)
+    d, bodies = hand.device, len(hand.model.tree.joint_dof) + 1
+    out = wp.empty((len(q), bodies), dtype=wp.transform, device=d)
+    inputs = [hand.struct.kin, wp.empty(0, dtype=wp.transform, device=d), on_device(q, wp.float32, d)]
+    wp.launch(place_bodies, dim=len(q), inputs=inputs, outputs=[out], device=d)
     return to_numpy(out).reshape(len(q), bodies, 7)

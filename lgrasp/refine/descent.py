@@ -8,7 +8,7 @@ import warp as wp
 from lgrasp.differentiable.solids import HandPoints, hand_solids
 from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_matrix, device_rotation
-from lgrasp.hand.arrays import HandArrays, body_poses
+from lgrasp.hand.arrays import HandArrays, body_poses, place_bodies
 from lgrasp.hand.contact_surface import palm_axis
 from lgrasp.hand.tree import Tree
 from lgrasp.math.lanes import LANES, lanes_of
@@ -27,7 +27,6 @@ from lgrasp.refine.match_kernels import (
     match_links,
     match_points,
     match_solids,
-    place_bodies,
 )
 from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes

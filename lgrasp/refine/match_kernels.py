@@ -5,9 +5,7 @@ Rows are hands; everything is frozen until it is matched again (:mod:`lgrasp.ref
 
 import warp as wp
 
-from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
 from lgrasp.math.lanes import lanes_before, lanes_count, lanes_least, lanes_max, lanes_sum, meet
-from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import Sdf, sdf_far, sdf_gradient, sdf_part, sdf_value
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -69,30 +67,6 @@ class Correspondences:
     link_pair: wp.array2d(dtype=wp.int32)  # (N, Q)
     link_deep: wp.array2d(dtype=wp.vec3)  # (N, Q * LINK_DEEPEST) points of links, their bodies' frames [m]
     link_plane: wp.array2d(dtype=wp.vec4)  # (N, Q * LINK_DEEPEST) of the other link, its body's frame
-
-
-@wp.kernel
-def place_bodies(
-    h: Kinematics,
-    pose: wp.array(dtype=wp.transform),
-    q: wp.array2d(dtype=wp.float32),
-    body_out: wp.array2d(dtype=wp.transform),
-):
-    """Bodies of hands in the object's frame; launched over hands.
-
-    Args:
-        pose: T_object_hand, (N,).
-        q: [rad or m], (N, K).
-        body_out: T_object_body, (N, B).
-    """
-    row = wp.tid()
-    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    T = pose[row]
-    body_out[row, 0] = T
-    for g in range(h.groups):
-        first = group_forward(h, g, group_dofs(h, g, q, row), X, 0)
-        for j in range(h.joint_first[g + 1] - first):
-            body_out[row, 1 + first + j] = T * X[j]
 
 
 @wp.func
