@@ -13,9 +13,10 @@ from lgrasp.math.kinematics import Kinematics
 from lgrasp.math.lanes import lanes_least, lanes_sum, meet, neighbours_sum
 from lgrasp.math.scratch import rows_of
 from lgrasp.refine.match_kernels import LINK_DEEPEST, Correspondences, Points, Solids
-from lgrasp.refine.params import LENGTH, STEEPEST
+from lgrasp.refine.params import LENGTH, STEEPEST, LocalSearch
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import params_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -48,32 +49,19 @@ class DescentScratch:
 DescentScratches, scratch_of = rows_of(DescentScratch)
 
 
-@wp.struct
-class Search:
-    """Weights and sizes of the local search, scaled: see :class:`lgrasp.refine.params.LocalSearch`."""
-
-    points: wp.float32  # over the sum of all weights
-    normals: wp.float32  # the same
-    force: wp.float32  # over the square of the number of contacts
-    barrier: wp.float32
-    limits: wp.float32  # over the number of joints
-    margin: wp.float32
-    link_margin: wp.float32
-    contacts: wp.int32
-    gradient_steps: wp.int32
-    sgd: wp.int32
-    momentum: wp.float32
-    max_translation_step: wp.float32
-    max_rotation_step: wp.float32
-    max_joint_step: wp.float32
-    decay: wp.float32
-    middle: wp.vec3  # what hands are turned about, base frame [m]
-    com: wp.vec3
-    radius: wp.float32
-    lower: wp.array(dtype=wp.float32)  # (K,) [rad or m]
-    upper: wp.array(dtype=wp.float32)  # (K,) [rad or m]
-    column: wp.array(dtype=wp.int32)  # (J,) column of q that moves each joint
-    near: wp.array(dtype=wp.float32)  # (K,) distance from a limit within which it repels [rad or m]
+Search = params_struct(
+    *("Search", __name__, LocalSearch),
+    sgd=wp.int32,
+    middle=wp.vec3,  # what hands are turned about, base frame [m]
+    com=wp.vec3,
+    radius=wp.float32,
+    lower=wp.array(dtype=wp.float32),  # (K,) [rad or m]
+    upper=wp.array(dtype=wp.float32),  # (K,) [rad or m]
+    column=wp.array(dtype=wp.int32),  # (J,) column of q that moves each joint
+    near=wp.array(dtype=wp.float32),  # (K,) distance from a limit within which it repels [rad or m]
+)
+"""Weights and sizes of the local search; weights of ``points`` and ``normals`` are over the sum of all points' weights,
+``force`` over the square of the number of contacts, ``limits`` over the number of joints."""
 
 
 @wp.func

@@ -9,6 +9,8 @@ from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
 from lgrasp.math.sdf import Sdf, sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import params_struct
+from lgrasp.stages.wrap.params import WrapParams
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -20,25 +22,10 @@ _GAP_WEIGHT = wp.constant(30.0)  # [1/m] beside the cosine of the normals: 0.1 m
 _WORTHLESS = wp.constant(-1.0e6)
 
 
-@wp.struct
-class WrapValues:
-    """WrapParams and GraspBounds as kernels read them."""
-
-    iterations: wp.int32
-    rounds: wp.int32
-    reach: wp.float32  # [m]
-    damping: wp.float32
-    normal_weight: wp.float32
-    step: wp.float32  # [rad or m]
-    contact_indentation: wp.float32  # [m]
-    gap: wp.float32  # [m]
-    cosine: wp.float32  # least, of the normals
-    max_gap: wp.float32  # [m]
-    min_cosine: wp.float32  # of the bounds
-    min_spread_cosine: wp.float32  # of the object's normals about a contact
-    allowed_penetration: wp.float32  # [m] of inner spheres
-    min_self_distance: wp.float32  # [m]
-    min_table_distance: wp.float32  # [m]
+_BOUNDS = "max_gap allowed_penetration min_self_distance min_table_distance"
+WrapValues = params_struct("WrapValues", __name__, WrapParams, floats=f"cosine min_cosine min_spread_cosine {_BOUNDS}")
+"""WrapParams and GraspBounds as kernels read them. Least cosines: of the normals, of these by the bounds, and of the
+object's normals about a contact."""
 
 
 @wp.struct
