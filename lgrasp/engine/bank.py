@@ -9,7 +9,7 @@ import numpy as np
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import InputKeys
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
+from lgrasp.grasp.tables import GraspTable, grasp_arrays, table_of
 
 BANK_VERSION = 5
 """Raised whenever the arrays of an entry change meaning; the versions of the stages are in the key too."""
@@ -65,7 +65,7 @@ class Bank:
         try:
             about = json.loads(str(arrays.pop(_NUMBERS_MEMBER)))
             about["spans"] = [(begin, end) for begin, end in about["spans"]]
-            account = Account(grasps_from_arrays(arrays), **about)
+            account = Account(table_of(GraspTable, arrays), **about)
         except (KeyError, ValueError, TypeError):
             self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; rebuilding it")
             return None
