@@ -25,11 +25,13 @@ _TOO_NEAR_PENETRATION = wp.constant(1.0)  # [m] penetration reported for an obje
 
 @wp.func
 def hand_pairs_clear(hand: Hand, a: wp.int32, b: wp.int32, X: wp.array(dtype=wp.transform), margin: wp.float32):
-    """Pairs of groups a <= b (0 = base, g + 1 = group g) of a whole hand, X[j] = pose of body 1 + j."""
+    """Pairs of two groups (0 = base, g + 1 = group g) of a whole hand, X[j] = pose of body 1 + j."""
+    first = wp.min(a, b)
+    last = wp.max(a, b)
     at = int(0)
-    if a > 0:
-        at = hand.kin.joint_first[a - 1]
-    return group_pairs_clear(hand, a, b, X, at, X, hand.kin.joint_first[b - 1], margin)
+    if first > 0:
+        at = hand.kin.joint_first[first - 1]
+    return group_pairs_clear(hand, first, last, X, at, X, hand.kin.joint_first[last - 1], margin)
 
 
 @wp.func

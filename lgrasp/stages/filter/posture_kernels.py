@@ -111,7 +111,7 @@ def place_touching(
             clear = hand_pairs_clear(hand, 0, g + 1, X, limits.min_self_distance)
             for f in range(G):
                 if clear and (f == g or (at_out.chosen[i, f] >= 0 and f < g) or group_fixed(hand, held, h, f)):
-                    clear = hand_pairs_clear(hand, wp.min(f, g) + 1, wp.max(f, g) + 1, X, limits.min_self_distance)
+                    clear = hand_pairs_clear(hand, f + 1, g + 1, X, limits.min_self_distance)
             if not clear:
                 found_out.outcome[i] = Outcome.SELF_COLLISION
                 return
@@ -185,11 +185,9 @@ def fill_unused(
                     clear = 0
                 for f in range(G):
                     # used fingers, those that stay, and unused ones that are placed already
-                    if f != g and (at_out.chosen[i, f] >= 0 or f < g or group_fixed(hand, held, h, f)):
-                        a = wp.min(g, f) + 1
-                        b = wp.max(g, f) + 1
-                        if clear == 1 and not hand_pairs_clear(hand, a, b, X, limits.min_self_distance):
-                            clear = 0
+                    there = f != g and (at_out.chosen[i, f] >= 0 or f < g or group_fixed(hand, held, h, f))
+                    if there and clear == 1 and not hand_pairs_clear(hand, f + 1, g + 1, X, limits.min_self_distance):
+                        clear = 0
                 if clear == 1:
                     at_out.posture[i, g] = x
                     found = 1

@@ -9,12 +9,12 @@ from lgrasp.field.arrays import Field
 from lgrasp.grasp.collision import body_clear, finger_above, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.grasp.structs import Candidates, Sets, State
-from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid, thumb_placed
+from lgrasp.hand.arrays import Hand, contact_allowed, thumb_placed
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.cholesky import solving
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column
 from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
-from lgrasp.math.sdf import sdf_gradient
+from lgrasp.math.sdf import sdf_gradient, sdf_of
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import params_struct
@@ -81,7 +81,7 @@ def _realising(size: int) -> Any:
         normal = -wp.transform_vector(T, obj.contact_normals[s])
         c = field.point[candidates_out.record[row, g, m]]
         grid = hand.contacts.grid[c]
-        sdf = hand_grid(hand.contacts, grid)
+        sdf = sdf_of(hand.contacts.grids, grid)
         j0 = hand.kin.joint_first[g]
         body = hand.contacts.body[c] - 1 - j0
         dofs = hand.kin.dof_free[g]
