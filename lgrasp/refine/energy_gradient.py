@@ -4,8 +4,6 @@ Every term pulls at points of bodies; a body's pulls make a force F and a moment
 frame, and these go down the joints.
 """
 
-import math
-
 import warp as wp
 
 from lgrasp.grasp.collision import plane_height
@@ -13,7 +11,7 @@ from lgrasp.math.kinematics import Kinematics
 from lgrasp.math.lanes import lanes_least, lanes_sum, meet, neighbours_sum
 from lgrasp.math.scratch import rows_of
 from lgrasp.refine.match_kernels import LINK_DEEPEST, Correspondences, Points, Solids
-from lgrasp.refine.params import LENGTH, STEEPEST, LocalSearch
+from lgrasp.refine.params import LENGTH, PARABOLA_BEND, PARABOLA_SLOPE, STEEPEST, LocalSearch
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import params_struct
@@ -24,9 +22,6 @@ MAX_COLUMNS = 32
 """Most joints that a hand's postures name."""
 
 _BLOCK_LANES, _LINK_LANES = wp.constant(8), wp.constant(4)  # that work on one block of points, one link
-_LOG_STEEPEST = math.log(STEEPEST)
-_PARABOLA_SLOPE = wp.constant(-2 * (STEEPEST - 1) * _LOG_STEEPEST - (STEEPEST - 1) ** 2 / STEEPEST)
-_PARABOLA_CONSTANT = wp.constant(-2 * _LOG_STEEPEST - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2)
 
 
 @wp.struct
@@ -70,7 +65,7 @@ def _repulsion(u: wp.float32):
     if u >= 1.0:
         return 0.0
     if u < STEEPEST:
-        return _PARABOLA_SLOPE + _PARABOLA_CONSTANT * (u - STEEPEST)
+        return PARABOLA_SLOPE + PARABOLA_BEND * (u - STEEPEST)
     return -2.0 * (u - 1.0) * wp.log(u) - (u - 1.0) * (u - 1.0) / u
 
 
