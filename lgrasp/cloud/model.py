@@ -56,7 +56,10 @@ def cloud_object(points: np.ndarray, normals: np.ndarray, *, name: str = "cloud"
         raise ObjectError(f"cloud '{name}': {bad} of {len(points)} points are NaN or infinite; drop them first")
     if len(points) < _LEAST_POINTS:
         raise ObjectError(f"cloud '{name}' has {len(points)} points; at least {_LEAST_POINTS} are needed")
-    _check_size(f"cloud '{name}'", points)
+    size, (least, most) = float(np.ptp(points, axis=0).max()), _EXTENT
+    if not least <= size <= most:
+        told = f"cloud '{name}' is {size:.3g} m long; accepted: {least:g} to {most:g} m (are its units metres?)"
+        raise ObjectError(told)
     digest = hashlib.sha256(np.ascontiguousarray(points).tobytes())
     keep = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
     normals = np.asarray(normals, float)
@@ -144,12 +147,6 @@ def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu
         contact_normals=outward,
         contact_opposite=opposite,
     )
-
-
-def _check_size(what: str, points: np.ndarray) -> None:
-    size, (least, most) = float(np.ptp(points, axis=0).max()), _EXTENT
-    if not least <= size <= most:
-        raise ObjectError(f"{what} is {size:.3g} m long; accepted: {least:g} to {most:g} m (are its units metres?)")
 
 
 def _model(

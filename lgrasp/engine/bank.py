@@ -11,7 +11,7 @@ import numpy as np
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.inputs import InputKeys
 from lgrasp.engine.pipeline import Pipeline
-from lgrasp.grasp.tables import GraspTable, grasp_arrays, grasps_from_arrays
+from lgrasp.grasp.tables import GraspTable, grasp_arrays, table_of
 from lgrasp.runtime.tally import covered
 
 BANK_VERSION = 5
@@ -84,7 +84,7 @@ class Bank:
             about = json.loads(str(arrays.pop(_NUMBERS_MEMBER)))
             kept, interrupted = about.pop("kept"), about.pop("interrupted")
             about["spans"] = [(begin, end) for begin, end in about["spans"]]
-            account = Account(ShardResult(grasps_from_arrays(arrays), **about), kept, interrupted)
+            account = Account(ShardResult(table_of(GraspTable, arrays), **about), kept, interrupted)
         except (KeyError, ValueError, TypeError):
             self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; rebuilding it")
             return None

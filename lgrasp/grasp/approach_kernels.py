@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.grasp.check_kernels import ALL, TOUCHING
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed
 from lgrasp.grasp.collision import body_depth, body_height, resting_plane
-from lgrasp.grasp.outcomes import APPROACH, KEPT, TABLE
+from lgrasp.grasp.outcomes import Outcome
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_dofs, group_forward
 from lgrasp.math.limits import MAX_BODIES
@@ -65,7 +65,7 @@ def check_table(hand: Hand, obj: Object, limits: Limits, part: wp.int32, at: Che
     row = at.of[i]
     g = hand.body_group[b]
     touching = g < 0 or (part != ALL and at.chosen[i, wp.max(g, 0)] >= 0)
-    if at.resting[row] < 0 or found_out.outcome[i] != KEPT:
+    if at.resting[row] < 0 or found_out.outcome[i] != Outcome.KEPT:
         return
     if part != ALL and touching != (part == TOUCHING):
         return
@@ -74,7 +74,7 @@ def check_table(hand: Hand, obj: Object, limits: Limits, part: wp.int32, at: Che
         B = at.body[i, b - 1]
     plane = resting_plane(obj, at.pose[row], at.resting[row])
     if body_height(hand.pieces, b, B, plane, limits.min_table_distance) < limits.min_table_distance:
-        found_out.outcome[i] = TABLE
+        found_out.outcome[i] = Outcome.TABLE
 
 
 @wp.kernel
@@ -151,5 +151,5 @@ def choose_approach(
         if (clear[i] >> k) & 1 == 1:
             packed_out.approach[i] = -retreat(palm, up, wp.transform_point(T, obj.com), k)
             return
-    wp.atomic_sub(counts_out, KEPT, 1)
-    wp.atomic_add(counts_out, APPROACH, 1)
+    wp.atomic_sub(counts_out, Outcome.KEPT, 1)
+    wp.atomic_add(counts_out, Outcome.APPROACH, 1)

@@ -38,8 +38,8 @@ from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_lig
 from lgrasp.grasp.stability_kernels import find_stable_squeeze
 from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.contact_surface import palm_axis
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.palm import palm_axis
 from lgrasp.math.constants import LOAD_DIRECTIONS
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.object.arrays import ObjectArrays
@@ -256,8 +256,7 @@ def check_grasps(
         index: candidate of each row; default: the row.
         seed: of the random rays of epsilon; default: 0.
     """
-    limits = device_limits(bounds, deepest=_MAX_RANKED_PENETRATION)
-    check = _measured(hand, obj, pose, q, contacts, limits, around, resting)
+    check = _measured(hand, obj, pose, q, contacts, bounds, around, resting)
     seed = wp.zeros(1, dtype=wp.int32, device=hand.device) if seed is None else seed
     table, outcome = check.every(seed, on_table=resting is not None)
     table.index[:] = np.arange(len(check)) if index is None else index
@@ -285,8 +284,7 @@ def compare_grasps(
     around: ObjectArrays | None = None,
 ) -> Compared:
     """A part of what :func:`check_grasps` finds, sooner; ``Args`` as there."""
-    limits = device_limits(bounds, deepest=_MAX_RANKED_PENETRATION)
-    check = _measured(hand, obj, pose, q, contacts, limits, around, None)
+    check = _measured(hand, obj, pose, q, contacts, bounds, around, None)
     check.decide()
     return Compared(*fetch([getattr(check.found, name) for name in Compared._fields]))
 
@@ -297,7 +295,7 @@ def _measured(
     pose: np.ndarray | wp.array,
     q: np.ndarray | wp.array,
     contacts: ContactTable,
-    limits: Limits,
+    bounds: GraspBounds,
     around: ObjectArrays | None,
     resting: np.ndarray | None,
 ) -> Check:
@@ -318,7 +316,8 @@ def _measured(
         contact=contacts.link,
         surface=wp.array(surface, dtype=wp.int32, device=d),
     )
-    places, found = link_places(model, contacts, d), new_findings(n, width, d)
+    limits = device_limits(bounds, deepest=_MAX_RANKED_PENETRATION)
+    places, found = _link_places(model, contacts, d), new_findings(n, width, d)
     check = Check(hand, obj, hold_nothing(hand), limits, places, at, found)
     inputs = [hand.struct, check.held.struct, limits, places, on_device(q, wp.float32, d)]
     wp.launch(check_postures, n, inputs, [at, found], device=d)
@@ -330,7 +329,7 @@ def _measured(
     return check
 
 
-def link_places(model: HandModel, contacts: ContactTable, device: str) -> Places:
+def _link_places(model: HandModel, contacts: ContactTable, device: str) -> Places:
     """Every link as a place on the hand, and the contacts as places on the object."""
     links = len(model.tree.link_names)
     grid = np.full(links, -1)

@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
 from lgrasp.grasp.collision import body_depth_slice, objects_apart
 from lgrasp.grasp.held import Held, body_depth_in_held, group_fixed
-from lgrasp.grasp.outcomes import CONTACT, KEPT, SELF_COLLISION, UNRESISTED_LOAD
+from lgrasp.grasp.outcomes import Outcome
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear, overlap_depth
 from lgrasp.math.kinematics import group_dofs, group_forward
@@ -25,11 +25,13 @@ _TOO_NEAR_PENETRATION = wp.constant(1.0)  # [m] penetration reported for an obje
 
 @wp.func
 def hand_pairs_clear(hand: Hand, a: wp.int32, b: wp.int32, X: wp.array(dtype=wp.transform), margin: wp.float32):
-    """Pairs of groups a <= b (0 = base, g + 1 = group g) of a whole hand, X[j] = pose of body 1 + j."""
+    """Pairs of two groups (0 = base, g + 1 = group g) of a whole hand, X[j] = pose of body 1 + j."""
+    first = wp.min(a, b)
+    last = wp.max(a, b)
     at = int(0)
-    if a > 0:
-        at = hand.kin.joint_first[a - 1]
-    return group_pairs_clear(hand, a, b, X, at, X, hand.kin.joint_first[b - 1], margin)
+    if first > 0:
+        at = hand.kin.joint_first[first - 1]
+    return group_pairs_clear(hand, first, last, X, at, X, hand.kin.joint_first[last - 1], margin)
 
 
 @wp.func
@@ -116,18 +118,18 @@ def check_postures(
     fit = fit_contacts(hand, places, at_out, i)
     found_out.gap[i] = fit[0]
     found_out.facing[i] = fit[1]
-    outcome = KEPT
+    outcome = int(Outcome.KEPT)
     few = touching < 2 or contacts < limits.min_contacts
     if few or fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
-        outcome = CONTACT
+        outcome = Outcome.CONTACT
     for b in range(G):
         for a in range(b + 2):
             other = wp.max(a - 1, 0)
             fixed = group_fixed(hand, held, h, b) and (a == 0 or group_fixed(hand, held, h, other))
-            if fixed or outcome != KEPT:
+            if fixed or outcome != Outcome.KEPT:
                 continue
             if not hand_pairs_clear(hand, a, b + 1, X, limits.min_self_distance):
-                outcome = SELF_COLLISION
+                outcome = Outcome.SELF_COLLISION
     found_out.outcome[i] = outcome
 
 
@@ -150,7 +152,7 @@ def measure_penetration(
         slices: of the points of a body (:func:`~lgrasp.grasp.collision.depth_slices`).
     """
     k, b, i = wp.tid()
-    if found_out.outcome[i] != KEPT and limits.whole == 0:
+    if found_out.outcome[i] != Outcome.KEPT and limits.whole == 0:
         return
     if found_out.penetration[i] > limits.deepest:
         return
@@ -178,7 +180,7 @@ def measure_held_penetration(
     One thread per (body, hand), the base's is that of the new object; ``penetration`` grows to the largest.
     """
     b, i = wp.tid()
-    if found_out.outcome[i] != KEPT or found_out.penetration[i] > limits.deepest:
+    if found_out.outcome[i] != Outcome.KEPT or found_out.penetration[i] > limits.deepest:
         return
     row = at.of[i]
     h = at.index[row] // held.tries
@@ -206,9 +208,9 @@ def count_outcomes(
         counts_out: (reasons,) grows by the hands of each outcome.
     """
     i = wp.tid()
-    if found_out.outcome[i] == KEPT and found_out.unresisted_load[i] > limits.max_unresisted_load:
-        found_out.outcome[i] = UNRESISTED_LOAD
-    kept_out[i] = wp.where(found_out.outcome[i] == KEPT, 1, 0)
+    if found_out.outcome[i] == Outcome.KEPT and found_out.unresisted_load[i] > limits.max_unresisted_load:
+        found_out.outcome[i] = Outcome.UNRESISTED_LOAD
+    kept_out[i] = wp.where(found_out.outcome[i] == Outcome.KEPT, 1, 0)
     wp.atomic_add(counts_out, found_out.outcome[i], 1)
 
 
@@ -221,7 +223,7 @@ def list_kept(found: Findings, upto: wp.array(dtype=wp.int32), row_out: wp.array
         row_out: (n,) the hands that passed, first.
     """
     i = wp.tid()
-    if found.outcome[i] == KEPT:
+    if found.outcome[i] == Outcome.KEPT:
         row_out[upto[i] - 1] = i
 
 

@@ -7,40 +7,16 @@ import warp as wp
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.outcomes import MEASURED
 from lgrasp.math.kinematics import vec_dof
-from lgrasp.runtime.structs import make_struct
+from lgrasp.runtime.structs import make_struct, params_struct
 
-
-@wp.struct
-class Limits:
-    """:class:`~lgrasp.grasp.bounds.GraspBounds` on a device; lengths in metres, angles by their cosines."""
-
-    max_gap: wp.float32
-    min_cosine: wp.float32  # of opposed normals
-    min_spread_cosine: wp.float32  # of the object's normals about a contact
-    max_penetration: wp.float32
-    allowed_penetration: wp.float32
-    min_self_distance: wp.float32
-    min_object_distance: wp.float32
-    min_contacts: wp.int32
-    friction: wp.float32
-    torque_scale: wp.float32
-    max_gswo: wp.float32
-    max_unresisted_load: wp.float32
-    min_epsilon: wp.float32
-    pregrasp_distance: wp.float32
-    min_pregrasp_distance: wp.float32
-    min_table_distance: wp.float32
-    squeeze_force: wp.float32
-    squeeze_stiffness: wp.float32
-    min_squeeze_travel: wp.float32
-    min_stable_squeeze: wp.float32
-    min_stable_pinch: wp.float32
-    max_closing_travel: wp.float32
-    max_closing_penetration: wp.float32
-    min_pregrasp_opening: wp.float32
-    squeeze_margin: wp.float32
-    deepest: wp.float32  # penetrations above this are not distinguished
-    whole: wp.int32  # 1: rows that failed are measured to the end
+Limits = params_struct(
+    *("Limits", __name__, GraspBounds),
+    min_cosine=wp.float32,  # of opposed normals
+    min_spread_cosine=wp.float32,  # of the object's normals about a contact
+    deepest=wp.float32,  # [m] penetrations above this are not distinguished
+    whole=wp.int32,  # 1: rows that failed are measured to the end
+)
+""":class:`~lgrasp.grasp.bounds.GraspBounds` on a device."""
 
 
 @wp.struct

@@ -3,9 +3,9 @@
 import warp as wp
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
-from lgrasp.hand.arrays import Hand, hand_grid
+from lgrasp.hand.arrays import Hand
 from lgrasp.math.convex import Pieces, point_depth
-from lgrasp.math.sdf import deeper, sdf_below, sdf_far, sdf_value
+from lgrasp.math.sdf import deeper, sdf_below, sdf_far, sdf_of, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -101,7 +101,7 @@ def body_depth_slice(
                     continue  # another piece of a link that is done
                 if grid >= 0:
                     # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
-                    sdf = hand_grid(hand.contacts, grid)
+                    sdf = sdf_of(hand.contacts.grids, grid)
                     if sdf_below(sdf, p, s[3]):
                         for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                             depth = deeper(sdf, wp.transform_point(T_body, obj.obstacles[i]), depth)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
-from lgrasp.grasp.outcomes import KEPT, PINCH, SQUEEZE
+from lgrasp.grasp.outcomes import PINCH, Outcome
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.cholesky import mat_dof, solve_dofs
 from lgrasp.math.constants import SLIDING_ARM
@@ -275,5 +275,5 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     through = packed.closing_penetration[i] > limits.max_closing_penetration
     if limp or still or far or through or packed.epsilon[i] < limits.min_epsilon:
         row_out[i] = -1
-        wp.atomic_sub(counts_out, KEPT, 1)
-        wp.atomic_add(counts_out, SQUEEZE, 1)
+        wp.atomic_sub(counts_out, Outcome.KEPT, 1)
+        wp.atomic_add(counts_out, Outcome.SQUEEZE, 1)

@@ -30,18 +30,6 @@ class Outcome(IntEnum):
 PINCH = wp.constant(2)
 """Contacts of a grasp that bounds.min_stable_pinch is for."""
 
-KEPT = wp.constant(int(Outcome.KEPT))
-UNUSED_FINGER = wp.constant(int(Outcome.UNUSED_FINGER))
-SELF_COLLISION = wp.constant(int(Outcome.SELF_COLLISION))
-OBJECT_COLLISION = wp.constant(int(Outcome.OBJECT_COLLISION))
-CONTACT = wp.constant(int(Outcome.CONTACT))
-BALANCE = wp.constant(int(Outcome.BALANCE))
-UNRESISTED_LOAD = wp.constant(int(Outcome.UNRESISTED_LOAD))
-TABLE = wp.constant(int(Outcome.TABLE))
-APPROACH = wp.constant(int(Outcome.APPROACH))
-SQUEEZE = wp.constant(int(Outcome.SQUEEZE))
-TOUCH = wp.constant(int(Outcome.TOUCH))
-
 REASONS = (
     *("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "unresisted load"),
     *("table", "approach", "squeeze"),

@@ -121,16 +121,9 @@ class TouchingGrasps:
     """The object's contact point nearest to each, index in ``contact_points`` of the object, (H, 2)."""
 
 
-@dataclass(frozen=True)
-class PredictedArrays:
-    """Predictions on a device."""
-
-    struct: "Predicted"
-
-
 def upload_predicted(
     hand: HandArrays, obj: ObjectArrays, held: HeldArrays, record: np.ndarray, pose: np.ndarray, q: np.ndarray
-) -> PredictedArrays:
+) -> "Predicted":
     """Put predictions on the hand's device, and find where they touch.
 
     Args:
@@ -143,7 +136,7 @@ def upload_predicted(
     values |= {"hand_point": points[0], "object_point": points[1]}
     struct = upload_struct(Predicted, hand.device, values)
     wp.launch(match_sides, (len(q), 2), [hand.struct, obj.struct, held.struct], [struct], device=hand.device)
-    return PredictedArrays(struct)
+    return struct
 
 
 def record_of_points(hand: HandModel, field: ContactField) -> np.ndarray:

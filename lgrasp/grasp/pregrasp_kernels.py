@@ -264,8 +264,7 @@ def open_fingers(
                 group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
                 done = int(1)
                 for b in range(G + 1):
-                    low, high = wp.min(b, g + 1), wp.max(b, g + 1)
-                    if done == 1 and not hand_pairs_clear(hand, low, high, X, limits.min_self_distance):
+                    if done == 1 and not hand_pairs_clear(hand, b, g + 1, X, limits.min_self_distance):
                         done = 0
         if done == 0:
             x = at.posture[s, g]

@@ -3,7 +3,7 @@
 import warp as wp
 
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places
-from lgrasp.grasp.outcomes import BALANCE, KEPT, OBJECT_COLLISION, TOUCH
+from lgrasp.grasp.outcomes import Outcome
 from lgrasp.math.constants import BALANCED, CONE_EDGES
 from lgrasp.math.frictionless import centroid
 from lgrasp.math.limits import MAX_CONTACTS
@@ -55,9 +55,9 @@ def _balanced(
 def balance_grasps(limits: Limits, places: Places, at: CheckedPostures, found_out: Findings):
     """FSWO (eq. 1), GSWO (eq. 2, pyramids) and its forces, object frame."""
     i = wp.tid()
-    if found_out.outcome[i] == KEPT and found_out.penetration[i] > limits.max_penetration:
-        found_out.outcome[i] = OBJECT_COLLISION
-    if found_out.outcome[i] != KEPT and limits.whole == 0:
+    if found_out.outcome[i] == Outcome.KEPT and found_out.penetration[i] > limits.max_penetration:
+        found_out.outcome[i] = Outcome.OBJECT_COLLISION
+    if found_out.outcome[i] != Outcome.KEPT and limits.whole == 0:
         return
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
@@ -71,8 +71,8 @@ def balance_grasps(limits: Limits, places: Places, at: CheckedPostures, found_ou
     gswo = _balanced(points, normals, k, limits.friction, CONE_EDGES, limits.torque_scale, BALANCED, forces)
     found_out.gswo[i] = gswo
     if gswo > limits.max_gswo:
-        if found_out.outcome[i] == KEPT:
-            found_out.outcome[i] = BALANCE
+        if found_out.outcome[i] == Outcome.KEPT:
+            found_out.outcome[i] = Outcome.BALANCE
         if limits.whole == 0:
             return
     for c in range(k):
@@ -87,7 +87,7 @@ def resist_loads(obj: Object, limits: Limits, places: Places, at: CheckedPosture
     if limits.whole == 1:
         most = 1.0
     worst = found_out.unresisted_load[i]
-    if worst > most or (found_out.outcome[i] != KEPT and limits.whole == 0):
+    if worst > most or (found_out.outcome[i] != Outcome.KEPT and limits.whole == 0):
         return
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
@@ -137,8 +137,8 @@ def drop_light(
                 on += push
     if on < least * whole:
         row_out[i] = -1
-        wp.atomic_sub(counts_out, KEPT, 1)
-        wp.atomic_add(counts_out, TOUCH, 1)
+        wp.atomic_sub(counts_out, Outcome.KEPT, 1)
+        wp.atomic_add(counts_out, Outcome.TOUCH, 1)
 
 
 @wp.kernel

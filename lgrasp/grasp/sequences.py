@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lgrasp.grasp.rows import CONTACTS
-from lgrasp.grasp.tables import GraspTable
+from lgrasp.grasp.tables import CONTACTS, GraspTable
 from lgrasp.hand.tree import Tree
 
 _LEAST = ("epsilon", "force_closure", "pregrasp_opening", "squeeze_travel", "stable_squeeze")

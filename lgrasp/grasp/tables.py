@@ -17,7 +17,9 @@ from lgrasp.grasp.structs import Candidates, Poses, Sets
 from lgrasp.runtime.fetch import fetch, to_numpy
 from lgrasp.runtime.structs import empty_arrays, make_struct
 
-_FAMILIES = ("metrics", "physics", "table")  # columns of a table in memory that come by name
+CONTACTS = ("contact_points", "contact_normals", "contact_links", "contact_forces")
+"""Columns of a table in memory that have room for C contacts."""
+_FAMILIES = ("metrics", "physics", "table")  # columns that come by name
 
 
 class DeviceTable:
@@ -195,7 +197,8 @@ def _families(table: Any) -> list[str]:
     return [f.name for f in fields(table) if f.name in _FAMILIES]
 
 
-def _of_arrays(kind: type[Rows], arrays: dict[str, np.ndarray]) -> Rows:
+def table_of(kind: type[Rows], arrays: dict[str, np.ndarray]) -> Rows:
+    """Inverse of :func:`grasp_arrays`."""
     own: dict[str, Any] = {family: {} for family in _families(kind)}
     for name, values in arrays.items():
         family, dot, member = name.partition(".")
@@ -206,22 +209,17 @@ def _of_arrays(kind: type[Rows], arrays: dict[str, np.ndarray]) -> Rows:
     return kind(**own)
 
 
-def grasps_from_arrays(arrays: dict[str, np.ndarray]) -> GraspTable:
-    """Inverse of :func:`grasp_arrays`."""
-    return _of_arrays(GraspTable, arrays)
-
-
 def no_grasps() -> GraspTable:
     """A GraspTable before anything is known of its columns."""
-    return grasps_from_arrays({f.name: np.zeros(0) for f in fields(GraspTable) if f.name not in _FAMILIES})
+    return table_of(GraspTable, {f.name: np.zeros(0) for f in fields(GraspTable) if f.name not in _FAMILIES})
 
 
 def take_rows(table: Rows, rows: np.ndarray | slice) -> Rows:
     """Some rows of a table in memory, by index or mask (n,)."""
     if isinstance(rows, slice) or rows.dtype == bool:
-        return _of_arrays(type(table), {name: values[rows] for name, values in grasp_arrays(table).items()})
+        return table_of(type(table), {name: values[rows] for name, values in grasp_arrays(table).items()})
     # many times as fast as indexing
-    return _of_arrays(type(table), {name: values.take(rows, axis=0) for name, values in grasp_arrays(table).items()})
+    return table_of(type(table), {name: values.take(rows, axis=0) for name, values in grasp_arrays(table).items()})
 
 
 def take_grasps(table: GraspTable, rows: np.ndarray) -> GraspTable:
@@ -235,7 +233,7 @@ def join_rows(tables: Sequence[Rows]) -> Rows:
     if len(tables) == 1:
         return tables[0]
     parts = [grasp_arrays(t) for t in tables]
-    return _of_arrays(type(tables[0]), {name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
+    return table_of(type(tables[0]), {name: np.concatenate([p[name] for p in parts]) for name in parts[0]})
 
 
 def choose_grasps(old: GraspTable, new: GraspTable, into: np.ndarray, rows: np.ndarray) -> GraspTable:
@@ -245,13 +243,13 @@ def choose_grasps(old: GraspTable, new: GraspTable, into: np.ndarray, rows: np.n
         if name != "slot":
             made[name] = made[name].copy()
             made[name][into] = values[rows]
-    return grasps_from_arrays(made)
+    return table_of(GraspTable, made)
 
 
 def widen_grasps(table: GraspTable, width: int) -> GraspTable:
     """The table with room for ``width`` contacts at least."""
     if table.contact_links.shape[1] >= width:
         return table
-    names = ("contact_points", "contact_normals", "contact_links", "contact_forces")
-    out = {name: padded(x, (width, *x.shape[2:])) if name in names else x for name, x in grasp_arrays(table).items()}
-    return grasps_from_arrays(out)
+    out = grasp_arrays(table)
+    out |= {name: padded(out[name], (width, *out[name].shape[2:])) for name in CONTACTS}
+    return table_of(GraspTable, out)

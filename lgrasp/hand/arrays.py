@@ -15,10 +15,10 @@ from lgrasp.hand.piece import Piece
 from lgrasp.math.convex import Pieces
 from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
 from lgrasp.math.limits import MAX_JOINTS
-from lgrasp.math.sdf import sdf_part
+from lgrasp.math.sdf import Grids
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.fetch import to_numpy
-from lgrasp.runtime.structs import upload_struct
+from lgrasp.runtime.structs import on_device, upload_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -33,11 +33,7 @@ class Contacts:
     body: wp.array(dtype=wp.int32)  # (C,)
     link: wp.array(dtype=wp.int32)  # (C,)
     grid: wp.array(dtype=wp.int32)  # (C,)
-    grid_first: wp.array(dtype=wp.int32)  # (L + 1,)
-    grid_shape: wp.array(dtype=wp.vec3i)  # (L,)
-    grid_origin: wp.array(dtype=wp.vec3)  # (L,) [m]
-    grid_inv_cell: wp.array(dtype=wp.float32)  # (L,) [1/m]
-    grid_values: wp.array(dtype=wp.float32)  # (cells of all grids,) [m]
+    grids: Grids  # L of them, of contact links
     grid_link: wp.array(dtype=wp.int32)  # (L,)
     rule_first: wp.array(dtype=wp.int32)  # (L + 1,)
     rules: wp.array(dtype=wp.vec4)  # (R,)
@@ -51,11 +47,7 @@ class Overlaps:
     first: wp.array(dtype=wp.int32)  # ((G + 1)^2 + 1,)
     sides: wp.array(dtype=wp.vec4i)  # (S,)
     points: wp.array(dtype=wp.vec3)  # (P,) [m]
-    grid_first: wp.array(dtype=wp.int32)  # (S + 1,)
-    grid_shape: wp.array(dtype=wp.vec3i)  # (S,)
-    grid_origin: wp.array(dtype=wp.vec3)  # (S,) [m]
-    grid_inv_cell: wp.array(dtype=wp.float32)  # (S,) [1/m]
-    grid_values: wp.array(dtype=wp.float32)  # (cells of all grids,) [m]
+    grids: Grids  # S of them
 
 
 @wp.struct
@@ -124,10 +116,11 @@ def upload_hand(model: HandModel, device: str, thumb: ThumbBend | None = None) -
     }
     meshes = _link_meshes(model, device)
     contacts = _named(Contacts, model, "contact_") | {
-        "grid_inv_cell": 1.0 / model.grid_cell,
+        "grids": upload_struct(Grids, device, _named(Grids, model, "grid_") | {"inv_cell": 1.0 / model.grid_cell}),
         "mesh": np.array([m.id for m in meshes], np.uint64),
     }
-    overlaps = _named(Overlaps, model, "overlap_") | {"grid_inv_cell": 1.0 / model.overlap_grid_cell}
+    grids = _named(Grids, model, "overlap_grid_") | {"inv_cell": 1.0 / model.overlap_grid_cell}
+    overlaps = _named(Overlaps, model, "overlap_") | {"grids": upload_struct(Grids, device, grids)}
     pieces = _named(Pieces, model, "piece_") | {"body_first": model.piece_first}
     grid_of = {int(link): i for i, link in enumerate(model.grid_link)}
     hand = _named(Hand, model) | {
@@ -189,12 +182,6 @@ def contact_run(hand: Hand, setting: wp.int32, side: wp.int32):
 
 
 @wp.func
-def hand_grid(c: Contacts, i: wp.int32):
-    """Distance grid of contact link i."""
-    return sdf_part(c.grid_values, c.grid_first[i], c.grid_shape[i], c.grid_origin[i], c.grid_inv_cell[i])
-
-
-@wp.func
 def contact_allowed(c: Contacts, i: wp.int32, normal: wp.vec3):
     """True if the rules of contact link i let it touch where its outward normal is this."""
     for r in range(c.rule_first[i], c.rule_first[i + 1]):
@@ -215,39 +202,41 @@ def thumb_placed(hand: Hand, g: wp.int32, X: wp.array(dtype=wp.transform), at: w
     return cosine >= bend.least and cosine <= bend.most
 
 
-@wp.func
-def overlap_grid(c: Overlaps, i: wp.int32):
-    """Distance grid of side i."""
-    return sdf_part(c.grid_values, c.grid_first[i], c.grid_shape[i], c.grid_origin[i], c.grid_inv_cell[i])
-
-
 @wp.kernel
 def place_bodies(
     h: Kinematics,
+    pose: wp.array(dtype=wp.transform),
     q: wp.array2d(dtype=wp.float32),
     # out
-    pose_out: wp.array2d(dtype=wp.transform),
+    body_out: wp.array2d(dtype=wp.transform),
 ):
-    """Bodies of postures in the base frame; launched over postures.
+    """Bodies of hands in some frame; launched over hands.
 
     Args:
+        pose: T_frame_base, (N,); or (0,): the frame is that of the base.
         q: [rad or m], (N, K).
-        pose_out: T_base_body, (N, B).
+        body_out: T_frame_body, (N, B).
     """
     row = wp.tid()
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    pose_out[row, 0] = wp.transform_identity()
+    T = wp.transform_identity()
+    if pose.shape[0] > 0:
+        T = pose[row]
+    body_out[row, 0] = T
     for g in range(h.groups):
         first = group_forward(h, g, group_dofs(h, g, q, row), X, 0)
         for j in range(h.joint_first[g + 1] - first):
-            pose_out[row, 1 + first + j] = X[j]
+            if pose.shape[0] > 0:
+                body_out[row, 1 + first + j] = T * X[j]
+            else:
+                body_out[row, 1 + first + j] = X[j]
 
 
 def body_poses(hand: HandArrays, q: np.ndarray) -> np.ndarray:
     """T_base_body of every body as device poses (N, B, 7) for postures q (N, K)."""
     q = np.ascontiguousarray(q, np.float32)
-    bodies = len(hand.model.tree.joint_dof) + 1
-    out = wp.empty((len(q), bodies), dtype=wp.transform, device=hand.device)
-    queries = wp.array(q, dtype=wp.float32, device=hand.device)
-    wp.launch(place_bodies, dim=len(q), inputs=[hand.struct.kin, queries], outputs=[out], device=hand.device)
+    d, bodies = hand.device, len(hand.model.tree.joint_dof) + 1
+    out = wp.empty((len(q), bodies), dtype=wp.transform, device=d)
+    inputs = [hand.struct.kin, wp.empty(0, dtype=wp.transform, device=d), on_device(q, wp.float32, d)]
+    wp.launch(place_bodies, dim=len(q), inputs=inputs, outputs=[out], device=d)
     return to_numpy(out).reshape(len(q), bodies, 7)

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from typing import get_args
 
 from lgrasp.choices import Role
-from lgrasp.hand.model import HandModel
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree
 
@@ -22,15 +21,15 @@ _TOLD: dict[Role, str] = {
 """What in a finger's name, in small letters, tells its role."""
 
 
-def finger_label(model: HandModel, names: Mapping[str, Sequence[str]], group: int) -> str:
+def finger_label(tree: Tree, names: Mapping[str, Sequence[str]], group: int) -> str:
     """Name of a dependency group: that of hand.yaml, else its last link."""
-    return _label(model.tree, names, group)
+    links = [n for n in tree.link_names if tree.group_of(n) == group]
+    return next((name for name, members in names.items() if set(members) & set(links)), links[-1])
 
 
-def finger_group(model: HandModel, names: Mapping[str, Sequence[str]], finger: str) -> int:
+def finger_group(tree: Tree, names: Mapping[str, Sequence[str]], finger: str) -> int:
     """The dependency group of a finger by its name of hand.yaml or that of a link; -1 if there is none."""
-    links = [n for n in names.get(finger, (finger,)) if n in model.tree.link_names]
-    return max((model.tree.group_of(n) for n in links), default=-1)
+    return max((tree.group_of(n) for n in names.get(finger, (finger,)) if n in tree.link_names), default=-1)
 
 
 def finger_roles(spec: HandSpec, tree: Tree) -> Roles:
@@ -39,10 +38,10 @@ def finger_roles(spec: HandSpec, tree: Tree) -> Roles:
     Roles are those of hand.yaml, else those that names of fingers tell, ``thumb`` or ``mfdistal``; fingers whose names
     tell none take the others in order.
     """
-    links: dict[str, list[str]] = {_label(tree, spec.fingers, g): [] for g in range(tree.groups)}
+    links: dict[str, list[str]] = {finger_label(tree, spec.fingers, g): [] for g in range(tree.groups)}
     for link in (link for rule in spec.contact for link in rule.links):
         if link in tree.link_names and (group := tree.group_of(link)) >= 0:
-            links[_label(tree, spec.fingers, group)].append(link)
+            links[finger_label(tree, spec.fingers, group)].append(link)
     roles = {role: finger for finger, role in spec.roles.items()}
     if not roles:
         for role, pattern in _TOLD.items():
@@ -54,8 +53,3 @@ def finger_roles(spec: HandSpec, tree: Tree) -> Roles:
         f: tuple(sorted(own, key=lambda n: (tree.body_of(n), tree.link_names.index(n)))) for f, own in links.items()
     }
     return {role: (roles[role], outwards[roles[role]]) for role in get_args(Role) if outwards.get(roles.get(role, ""))}
-
-
-def _label(tree: Tree, names: Mapping[str, Sequence[str]], group: int) -> str:
-    links = [n for n in tree.link_names if tree.group_of(n) == group]
-    return next((name for name, members in names.items() if set(members) & set(links)), links[-1])

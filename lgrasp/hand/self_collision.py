@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from lgrasp.hand.arrays import Hand, overlap_grid
+from lgrasp.hand.arrays import Hand
 from lgrasp.math.convex import pieces_clear
-from lgrasp.math.sdf import sdf_value
+from lgrasp.math.sdf import sdf_of, sdf_value
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -16,7 +16,7 @@ OVERLAP = 8.5e-4
 @wp.func
 def _side_depth(hand: Hand, k: wp.int32, T: wp.transform, limit: wp.float32):
     """Deepest point [m] of side k in its grid, 0 when apart; stops early above ``limit``. T = T_grid_points."""
-    grid = overlap_grid(hand.overlaps, k)
+    grid = sdf_of(hand.overlaps.grids, k)
     side = hand.overlaps.sides[k]
     depth = float(0.0)
     for i in range(side[2], side[3]):

@@ -1,13 +1,17 @@
-"""Sides of fingers' links: radial where of a row of fingers the index finger stands, ulnar the other; and tips."""
+"""Sides of fingers' links: radial where of a row of fingers the index finger stands, ulnar the other; and tips.
 
-from typing import NamedTuple
+Where a thumb is: adducted, it bends more along the palm, as to press on the side of the index finger; abducted, more
+across it, to oppose fingertips.
+"""
+
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from lgrasp.choices import Role, SideName
+from lgrasp.choices import Role, SideName, ThumbPlace
 from lgrasp.hand.fingers import finger_roles
 from lgrasp.hand.links import link_poses
-from lgrasp.hand.params import LinkSide
+from lgrasp.hand.params import LinkSide, ThumbBend
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf
@@ -16,12 +20,14 @@ _ANGLE = 40.0  # [deg] about the axis of a side
 _MIN_ROW_COSINE = 0.5  # of a finger's last hinge to the way to its neighbour, at least
 _MIN_PARALLEL_COSINE = 0.7  # of the last hinges of neighbours, at least
 _MIN_LENGTH = 0.005  # [m] of a link, across its hinge
+_MIN_RANGE = 30.0  # [deg] of the angle between the planes in which a thumb bends and of the palm
+_POSTURES = 4096  # that tell the range
 
 LinkSides = dict[str, dict[SideName, LinkSide]]
 """Links with collision geometry of one finger, from the palm outwards, each with its sides."""
 
 
-class Hinge(NamedTuple):
+class _Hinge(NamedTuple):
     """The last hinge of a finger in the open posture, base frame."""
 
     axis: np.ndarray  # (3,) unit
@@ -38,10 +44,10 @@ def finger_sides(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[Role, LinkSides
     """
     poses = posture_links(urdf, tree, tree.joint_open[None])
     ends: dict[Role, str] = {role: links[-1] for role, (_, links) in finger_roles(spec, tree).items()}
-    hinges = last_hinges(spec, urdf, tree)
+    hinges = _last_hinges(spec, urdf, tree)
     found: dict[Role, LinkSides] = {}
     for role, hinge in hinges.items():
-        radial = radial_way(hinges, role)
+        radial = _radial_way(hinges, role)
         group = tree.group_of(ends[role])
         links = [n for n in tree.link_names if tree.group_of(n) == group and urdf.links[n]]
         links.sort(key=lambda n: (tree.body_of(n), tree.link_names.index(n)))
@@ -52,7 +58,8 @@ def finger_sides(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[Role, LinkSides
                 ways |= {"radial": radial, "ulnar": -radial}
             ways |= {"tip": hinge.along} if link == ends[role] else {}
             R = poses[link][0, :3, :3]
-            found[role][link] = {side: _side(link, side, R.T @ way) for side, way in ways.items() if way is not None}
+            axes = {side: _rounded(R.T @ way) for side, way in ways.items() if way is not None}
+            found[role][link] = {s: LinkSide(link=link, side=s, axis=axis, angle=_ANGLE) for s, axis in axes.items()}
     return found
 
 
@@ -61,24 +68,20 @@ def posture_links(urdf: Urdf, tree: Tree, q: np.ndarray) -> dict[str, np.ndarray
     return link_poses(urdf, tree.base_link, dict(zip(tree.listed_names, tree.listed_values(q).T, strict=True)))
 
 
-def last_hinges(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[Role, Hinge]:
+def _last_hinges(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[Role, _Hinge]:
     """The last joint of every finger that turns there, in the order of roles."""
     poses = {name: T[0] for name, T in posture_links(urdf, tree, tree.joint_open[None]).items()}
     ends: dict[Role, int] = {role: tree.body_of(links[-1]) for role, (_, links) in finger_roles(spec, tree).items()}
     return {role: _last_hinge(tree, poses, body) for role, body in ends.items() if not tree.joint_prismatic[body - 1]}
 
 
-def _side(link: str, side: SideName, axis: np.ndarray) -> LinkSide:
-    return LinkSide(link=link, side=side, axis=rounded(axis), angle=_ANGLE)
-
-
-def rounded(v: np.ndarray) -> tuple[float, float, float]:
+def _rounded(v: np.ndarray) -> tuple[float, float, float]:
     """A unit vector (3,) as it is told."""
     x, y, z = (np.round(v, 4) + 0.0).tolist()
     return x, y, z
 
 
-def radial_way(hinges: dict[Role, Hinge], role: Role) -> np.ndarray | None:
+def _radial_way(hinges: dict[Role, _Hinge], role: Role) -> np.ndarray | None:
     """Unit vector (3,) out of a finger's radial side, base frame; None for a thumb, or if it stands beside no other."""
     row: list[Role] = [other for other in hinges if other != "thumb"]
     if role not in row or len(row) < 2:
@@ -92,7 +95,7 @@ def radial_way(hinges: dict[Role, Hinge], role: Role) -> np.ndarray | None:
     return np.sign(cosine) * hinge.axis
 
 
-def _last_hinge(tree: Tree, poses: dict[str, np.ndarray], body: int) -> Hinge:
+def _last_hinge(tree: Tree, poses: dict[str, np.ndarray], body: int) -> _Hinge:
     """The hinge that moves a body.
 
     Args:
@@ -106,5 +109,38 @@ def _last_hinge(tree: Tree, poses: dict[str, np.ndarray], body: int) -> Hinge:
         way = place - frames[before][:3, 3]
         way = way - axis * (axis @ way)
         if np.linalg.norm(way) > _MIN_LENGTH:
-            return Hinge(axis, place, way / np.linalg.norm(way))
-    return Hinge(axis, place, None)
+            return _Hinge(axis, place, way / np.linalg.norm(way))
+    return _Hinge(axis, place, None)
+
+
+def thumb_bends(spec: HandSpec, urdf: Urdf, tree: Tree) -> dict[ThumbPlace, ThumbBend]:
+    """The places that the thumb of a hand can be in: halves of the range of the angle between the plane in which its
+    last joint bends and the palm's; none for hands whose thumb hardly turns so, or is beside no row of fingers.
+
+    The palm's plane holds the row of fingers, straight as in the open posture.
+    """
+    hinges = _last_hinges(spec, urdf, tree)
+    rows = ((hinge.along, _radial_way(hinges, role)) for role, hinge in hinges.items())
+    planes = [np.cross(along, radial) for along, radial in rows if along is not None and radial is not None]
+    if not planes or "thumb" not in hinges:
+        return {}
+    normal = planes[0] / np.linalg.norm(planes[0])
+    link = finger_roles(spec, tree)["thumb"][1][-1]
+    at, body = tree.link_names.index(link), tree.body_of(link)
+    axis = tree.T_body_link[at, :3, :3].T @ tree.joint_axis[body - 1]
+    lines = np.abs(posture_links(urdf, tree, _postures(tree))[link][:, :3, :3] @ axis @ normal)
+    angles = np.degrees(np.arccos(np.minimum(lines, 1.0)))
+    if np.ptp(angles) < _MIN_RANGE:
+        return {}
+    middle = round(float(angles.min() + angles.max()) / 2)
+    told: dict[str, Any] = {"link": link, "axis": _rounded(axis), "normal": _rounded(normal), "angle": middle}
+    return {place: ThumbBend(place=place, **told) for place in get_args(ThumbPlace)}
+
+
+def _postures(tree: Tree) -> np.ndarray:
+    """Random joint positions [rad or m], shape [_POSTURES, K], with values of shared joints that a hand takes."""
+    rng = np.random.default_rng(0)
+    q = rng.uniform(tree.joint_lower, tree.joint_upper, (_POSTURES, len(tree.joint_names)))
+    shared = [tree.joint_names.index(name) for name in tree.shared_names]
+    q[:, shared] = rng.choice(tree.settings, _POSTURES)[:, shared]
+    return q

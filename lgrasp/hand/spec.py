@@ -1,25 +1,13 @@
 """hand.yaml: the few things about a hand that its URDF does not say."""
 
-import difflib
-import reprlib
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from lgrasp.choices import Role
-from lgrasp.config import first_problem, load_yaml_file
-from lgrasp.errors import HandError, short_reason
+from lgrasp.config import parse_model, read_yaml
+from lgrasp.errors import ConfigError, HandError
 
 Vec3 = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
@@ -149,20 +137,6 @@ class HandSpec(_Strict):
         return roles
 
 
-def spec_problem(error: ValidationError) -> str:
-    """First problem of a pydantic error as one phrase: key, value, problem, the nearest valid key."""
-    first, key = first_problem(error)
-    if first["type"] == "extra_forbidden":
-        kinds = (HandSpec, ContactRule, PalmRule, Surface, Box, Coupling, OppositionSpace)
-        known = list(dict.fromkeys(name for kind in kinds for name in kind.model_fields))
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-        return f"unknown key '{key}'" + (f"; did you mean '{near[0]}'?" if near else f"; keys: {', '.join(known)}")
-    what = " ".join(first["msg"].removeprefix("Value error, ").split())
-    # only plain values are shown, shortened: nested YAML aliases would print without end
-    plain = isinstance(first["input"], str | int | float | None)
-    return f"key '{key}': {what}" + (f" (got {reprlib.repr(first['input'])})" if plain else "")
-
-
 def load_spec(path: Path) -> HandSpec:
     """Read hand.yaml.
 
@@ -170,12 +144,6 @@ def load_spec(path: Path) -> HandSpec:
         HandError: unreadable file, bad YAML, unknown key or bad value.
     """
     try:
-        data = load_yaml_file(path)
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise HandError(f"hand file {path} cannot be read as YAML: {short_reason(error, 300)}") from None
-    if not isinstance(data, dict):
-        raise HandError(f"hand file {path} must be a YAML mapping with the keys of hand.yaml")
-    try:
-        return HandSpec.model_validate(data)
-    except ValidationError as error:
-        raise HandError(f"hand file {path}: {spec_problem(error)}") from None
+        return parse_model(HandSpec, read_yaml(path), f"hand file {path}")
+    except ConfigError as error:
+        raise HandError(str(error)) from None

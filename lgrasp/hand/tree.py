@@ -139,6 +139,10 @@ class Tree:
         """Group that a link belongs to, -1 for static ones."""
         return int(self.body_group[self.body_of(link)])
 
+    def surface_of(self, link: str) -> int:
+        """Group of a link among contact surfaces: that of static links comes last."""
+        return self.group_of(link) % (self.groups + 1)
+
     def links_on(self, body: int) -> list[str]:
         """Links that ride on a body."""
         return [name for name, b in zip(self.link_names, self.link_body, strict=True) if b == body]

@@ -38,13 +38,11 @@ def whole_hand(source: HandSource, model: HandModel, device: str) -> HandModel:
             palmar = own & (side.normals @ facing > 0.0)
             rules = np.array([[*-facing, _PALMAR_COSINE]])
             links.append(ContactLink(name, tree.group_of(name), side.points[palmar], side.normals[palmar], rules))
-    links = [_thinned(link) if link.group < tree.groups else link for link in links]
+    # fewer points of each finger link, so that the field draws about as many contacts of each
+    for k, link in enumerate(links):
+        if link.group < tree.groups:
+            links[k] = replace(link, points=link.points[:_MOST_POINTS], normals=link.normals[:_MOST_POINTS])
     return replace(model, **surface_arrays(model, urdf, links, device))
-
-
-def _thinned(link: ContactLink) -> ContactLink:
-    """The link with fewer points, so that the field draws about as many contacts of each link."""
-    return replace(link, points=link.points[:_MOST_POINTS], normals=link.normals[:_MOST_POINTS])
 
 
 def palmar_hand(source: HandSource, model: HandModel, side: ContactSurface, device: str) -> HandModel:
@@ -57,9 +55,8 @@ def palmar_hand(source: HandSource, model: HandModel, side: ContactSurface, devi
     tree = model.tree
     links = []
     for link in np.setdiff1d(side.link, model.grid_link):
-        group, own = tree.group_of(tree.link_names[link]), side.link == link
-        group = group if group >= 0 else model.groups
-        links.append(ContactLink(tree.link_names[link], group, side.points[own], side.normals[own], np.empty((0, 4))))
+        name, own = tree.link_names[link], side.link == link
+        links.append(ContactLink(name, tree.surface_of(name), side.points[own], side.normals[own], np.empty((0, 4))))
     if not links:
         return model
     others = surface_arrays(model, read_urdf(source.urdf), links, device)
@@ -70,12 +67,10 @@ def listed_links(model: HandModel) -> list[ContactLink]:
     """Contact surface of the links that hand.yaml lists, in the order of their grids."""
     found = []
     for grid, link in enumerate(model.grid_link):
-        own = model.contact_grid == grid
-        name = model.tree.link_names[link]
-        group = model.tree.group_of(name)
+        name, own = model.tree.link_names[link], model.contact_grid == grid
         rules = model.rules[model.rule_first[grid] : model.rule_first[grid + 1]]
-        group = group if group >= 0 else model.groups
-        found.append(ContactLink(name, group, model.contact_points[own], model.contact_normals[own], rules))
+        points, normals = model.contact_points[own], model.contact_normals[own]
+        found.append(ContactLink(name, model.tree.surface_of(name), points, normals, rules))
     return found
 
 

@@ -3,10 +3,10 @@
 import warp as wp
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
-from lgrasp.hand.arrays import Hand, hand_grid
+from lgrasp.hand.arrays import Hand
 from lgrasp.hold.scratch import MAX_TAGS, MAX_TOUCHES, Contact, Scratch
 from lgrasp.math.lanes import lanes_least, lanes_max, meet
-from lgrasp.math.sdf import sdf_gradient, sdf_value
+from lgrasp.math.sdf import sdf_gradient, sdf_of, sdf_value
 from lgrasp.math.transforms import tangent
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -37,12 +37,12 @@ def _on_both(hand: Hand, obj: Object, b: wp.int32, T: wp.transform, x: wp.vec3):
     for piece in range(hand.pieces.body_first[b], hand.pieces.body_first[b + 1]):
         k = hand.piece_grid[piece]
         if k >= 0 and k != grid:
-            d = sdf_value(hand_grid(hand.contacts, k), local)
+            d = sdf_value(sdf_of(hand.contacts.grids, k), local)
             if d < least:
                 least = d
                 grid = k
     if grid >= 0 and least < 2.0e-3:
-        link = hand_grid(hand.contacts, grid)
+        link = sdf_of(hand.contacts.grids, grid)
         # to the nearest points of both surfaces, one after the other; the object's lies so deep that they do not meet
         for _it in range(2):
             local = wp.transform_point(T_body, p - n * (gap + _DEEP))

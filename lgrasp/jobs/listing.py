@@ -8,11 +8,11 @@ from pydantic import BaseModel
 from lgrasp.config import read_yaml
 from lgrasp.engine.pipeline import load_pipeline, pipeline_files
 from lgrasp.errors import ConfigError
-from lgrasp.hand.names import PACKAGE_HANDS, known_hands, pip_line
+from lgrasp.hand.names import PACKAGE_HANDS, known_hands
 from lgrasp.hand.spec import load_spec
 from lgrasp.learn.networks import find_network, known_networks, read_card
 from lgrasp.object.find import list_objects as named_objects
-from lgrasp.paths import data_dirs, is_installed
+from lgrasp.paths import data_dirs, is_installed, pip_line
 from lgrasp.policy.names import SHIPPED, shipped_policy
 
 

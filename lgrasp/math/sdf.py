@@ -40,19 +40,29 @@ def block_minima(values: np.ndarray) -> np.ndarray:
     return values.ravel()
 
 
+@wp.struct
+class Grids:
+    """Distance grids [m] that share one array."""
+
+    first: wp.array(dtype=wp.int32)  # (n,) or more, place of each in ``values``
+    shape: wp.array(dtype=wp.vec3i)  # (n,)
+    origin: wp.array(dtype=wp.vec3)  # (n,) [m]
+    inv_cell: wp.array(dtype=wp.float32)  # (n,) [1/m]
+    values: wp.array(dtype=wp.float32)  # (cells of all grids,) [m]
+
+
 @wp.func
-def sdf_part(
-    values: wp.array(dtype=wp.float32), first: wp.int32, shape: wp.vec3i, origin: wp.vec3, inv_cell: wp.float32
-):
-    """The grid that begins at place ``first`` of a shared array."""
+def sdf_of(g: Grids, i: wp.int32):
+    """Grid i of several."""
     s = Sdf()
-    s.values = values
-    s.first = first
+    s.values = g.values
+    s.first = g.first[i]
+    shape = g.shape[i]
     s.nx = shape[0]
     s.ny = shape[1]
     s.nz = shape[2]
-    s.origin = origin
-    s.inv_cell = inv_cell
+    s.origin = g.origin[i]
+    s.inv_cell = g.inv_cell[i]
     return s
 
 

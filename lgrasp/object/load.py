@@ -79,7 +79,8 @@ def load_mesh(
         except OSError as error:
             raise ObjectError(f"{label}: {error.filename or label}: {error.strerror or error}") from error
         sha = mesh_digest(files)
-        vertices, faces, parts = _parse(path, files)
+        meshes = mesh_parts(path, files)
+        (vertices, faces), parts = join_parts(path, meshes), len(meshes)
     if not len(faces):
         raise ObjectError(f"{label}: 0 faces; a triangle mesh of a solid is accepted")
     used = np.zeros(len(vertices), bool)
@@ -188,12 +189,6 @@ def join_parts(path: Path, meshes: Sequence[trimesh.Trimesh]) -> tuple[np.ndarra
             f"{path}: a face names vertex {faces.max()} of {len(vertices)}; existing vertices are accepted"
         )
     return vertices, faces
-
-
-def _parse(path: Path, files: Mapping[str, bytes]) -> tuple[np.ndarray, np.ndarray, int]:
-    """Vertices, faces and the number of geometries of a mesh file's bytes."""
-    meshes = mesh_parts(path, files)
-    return *join_parts(path, meshes), len(meshes)
 
 
 def _check_size(label: str, vertices: np.ndarray, scale: float, params: ObjectParams) -> None:

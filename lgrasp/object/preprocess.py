@@ -12,13 +12,7 @@ from lgrasp.object.mass import mass_properties
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid, build_sdf
-from lgrasp.object.surface import (
-    fold_cosine,
-    opposite_points,
-    probe_fits,
-    sample_surface,
-    thin,
-)
+from lgrasp.object.surface import fold_cosine, opposite_points, probe_fits, sample_surface, thin
 
 _RELAXED_ANGLES = (25.0, 35.0)  # [deg] tried when the sharpness mask leaves too few contact points
 

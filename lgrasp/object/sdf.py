@@ -125,14 +125,9 @@ def _closed_inside(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, 
     """Inside flags of all cells from the signed surface crossings of z columns."""
     shifted = origin.astype(np.float64) + cell * np.array(_LATTICE_SHIFT)
     step = wp.zeros(dims, dtype=wp.int32)
-    inputs = [
-        wp.array(vertices, dtype=wp.vec3d),
-        wp.array(faces, dtype=wp.int32),
-        wp.vec3d(*shifted.tolist()),
-        cell,
-        wp.vec3i(*dims),
-    ]
-    wp.launch(kernels.lattice_crossings, len(faces), inputs, [step])
+    mesh = [wp.array(vertices, dtype=wp.vec3d), wp.array(faces, dtype=wp.int32)]
+    lattice = [wp.vec3d(*shifted.tolist()), cell, wp.vec3i(*dims)]
+    wp.launch(kernels.lattice_crossings, len(faces), [*mesh, *lattice], [step])
     return np.cumsum(to_numpy(step), axis=2, dtype=np.int32) > 0
 
 

@@ -67,14 +67,16 @@ def _between(rng: np.random.Generator, low: float, high: float) -> float:
 def _solid(rng: np.random.Generator, *size: float) -> Any:
     """A convex solid about the origin in a box of a size (3,) [m]."""
     kind = rng.integers(6)
-    if kind == 2 or kind == 3:
-        mesh = icosphere(3, 0.5) if kind == 2 else capsule(1.0, 0.5, count=(32, 32))
+    if kind == 0:
+        mesh = box((1, 1, 1))
+    elif kind == 2:
+        mesh = icosphere(3, 0.5)
+    elif kind == 3:
+        mesh = capsule(1.0, 0.5, count=(32, 32))
     elif kind == 4:
         mesh = cone(0.5, 1.0, sections=48)
     else:
-        mesh = (
-            box((1, 1, 1)) if kind == 0 else cylinder(0.5, 1.0, sections=48 if kind == 1 else int(rng.integers(3, 9)))
-        )
+        mesh = cylinder(0.5, 1.0, sections=48 if kind == 1 else int(rng.integers(3, 9)))
     mesh.apply_translation(-mesh.bounds.mean(0))
     mesh.apply_scale(np.array(size) / mesh.extents)
     return mesh
@@ -141,11 +143,8 @@ def _turned(*profile: tuple[float, float]) -> list[Any]:
 def _bottle(rng: np.random.Generator) -> list[Any]:
     """A body, a shoulder and a neck."""
     radius, height = _between(rng, 0.02, 0.045), _between(rng, 0.09, 0.22)
-    neck, body, shoulder = (
-        radius * rng.uniform(0.25, 0.6),
-        height * rng.uniform(0.4, 0.7),
-        height * rng.uniform(0.1, 0.2),
-    )
+    neck = radius * rng.uniform(0.25, 0.6)
+    body, shoulder = height * rng.uniform(0.4, 0.7), height * rng.uniform(0.1, 0.2)
     bend = np.linspace(0, np.pi, 9)
     curve = zip(neck + (radius - neck) * (1 + np.cos(bend)) / 2, body + shoulder * bend / np.pi, strict=True)
     return _turned((0, 0), (radius, 0), *curve, (neck, height), (0, height))

@@ -125,10 +125,6 @@ class PlanParams(Params):
         bounds = self.bounds.changed(min_hold_probability=least if own["tried"] else 0.0)
         return Effort(hold=self.hold, search=search, bounds=bounds, **own)
 
-    def weights(self) -> dict[str, float]:
-        """Arguments of :func:`hand_surface`."""
-        return {"distal": self.distal, "other": self.other}
-
 
 def cloud_params(params: PlanParams) -> PlanParams:
     """The parameters for an object that is a point cloud, whose points lie off its surface by their noise."""

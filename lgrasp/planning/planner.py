@@ -16,9 +16,7 @@ from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import NOT_HELD, REASONS, Outcome, bounds_squeeze, failed_bounds
 from lgrasp.grasp.tables import GraspTable, join_rows, take_grasps, take_rows
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.contact_surface import ContactSurface
-from lgrasp.hand.palm import palm_axis
-from lgrasp.hold.params import HoldTest
+from lgrasp.hand.contact_surface import ContactSurface, palm_axis
 from lgrasp.hold.run import METRICS, ControlPoses, HoldTester
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.model import ObjectModel
@@ -134,12 +132,17 @@ class Planner:
 
     @cached_property
     def _scene(self) -> "_Scene":
-        device, surface = self.hand.device, hand_surface(self.hand.model, self.palmar, **self.params.weights())
+        device, p = self.hand.device, self.params
+        surface = hand_surface(self.hand.model, self.palmar, distal=p.distal, other=p.other)
         around = None if self.around is None else upload_object(self.around, device)
         target = upload_target(self.model, self.around, device)
         obj, search = upload_object(self.model, device), Descent(self.hand, target, self.effort.search, surface)
         others = [upload_object(other, device) for other in self.others]
-        return _Scene(search, obj, around, _tester(self.hand, obj, self.effort.hold, others))
+        try:
+            tester = HoldTester(self.hand, obj, self.effort.hold, others)
+        except ObjectError:
+            tester = None
+        return _Scene(search, obj, around, tester)
 
     def _plan(self, search: Descent, points: np.ndarray, first: int) -> tuple[GraspTable, np.ndarray]:
         """The best hand of each start that does not collide, and its outcome."""
@@ -281,13 +284,6 @@ class _Scene:
     around: ObjectArrays | None
     tester: HoldTester | None
     """None: nothing is known of the object but a plane, which has no mass."""
-
-
-def _tester(hand: HandArrays, obj: ObjectArrays, test: HoldTest, others: list[ObjectArrays]) -> HoldTester | None:
-    try:
-        return HoldTester(hand, obj, test, others)
-    except ObjectError:
-        return None
 
 
 @wp.kernel

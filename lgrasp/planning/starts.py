@@ -4,8 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lgrasp.geometry.poses import device_pose, shortest_rotation
+from lgrasp.hand.contact_surface import palm_axis
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.palm import palm_axis
 
 STAND_OFF = 0.12
 """Distance of a hand's base from the surface where hand.yaml has no ``stand_off`` [m]."""

@@ -8,11 +8,12 @@ import warp as wp
 from lgrasp.differentiable.solids import HandPoints, hand_solids
 from lgrasp.errors import HandError
 from lgrasp.geometry.poses import device_matrix, device_rotation
-from lgrasp.hand.arrays import HandArrays, body_poses
-from lgrasp.hand.palm import palm_axis
+from lgrasp.hand.arrays import HandArrays, body_poses, place_bodies
+from lgrasp.hand.contact_surface import palm_axis
 from lgrasp.hand.tree import Tree
 from lgrasp.math.lanes import LANES, lanes_of
 from lgrasp.math.scratch import empty_rows
+from lgrasp.math.sdf import Grids
 from lgrasp.refine.descent_kernels import Moments, Parts, Schedule, advance, descend, penetration
 from lgrasp.refine.energy_gradient import MAX_COLUMNS, DescentScratches, Search
 from lgrasp.refine.hands import Hands
@@ -27,7 +28,6 @@ from lgrasp.refine.match_kernels import (
     match_links,
     match_points,
     match_solids,
-    place_bodies,
 )
 from lgrasp.refine.params import LIMIT_SHARE, LocalSearch
 from lgrasp.refine.surface import BLOCK, LINK_POINTS, HandSurface, link_probes
@@ -240,15 +240,18 @@ def _points(surface: HandSurface, device: str) -> "Points":
 
 
 def _solids(found: HandPoints, device: str) -> "Solids":
-    grids = [x.grid for x in found.solids]
+    own = [x.grid for x in found.solids]
+    grids = {
+        "first": np.cumsum([0, *[g.values.size for g in own[:-1]]]),
+        "shape": np.array([g.values.shape for g in own]),
+        "origin": np.array([g.origin for g in own]),
+        "inv_cell": 1.0 / np.array([g.cell for g in own]),
+        "values": np.concatenate([g.values.ravel() for g in own]),
+    }
     arrays = {
         "body": found.body,
         "ball": np.stack([x.ball for x in found.solids]),
-        "grid_first": np.cumsum([0, *[g.values.size for g in grids[:-1]]]),
-        "grid_shape": np.array([g.values.shape for g in grids]),
-        "grid_origin": np.array([g.origin for g in grids]),
-        "grid_inv_cell": 1.0 / np.array([g.cell for g in grids]),
-        "grid_values": np.concatenate([g.values.ravel() for g in grids]),
+        "grids": upload_struct(Grids, device, grids),
         "points": np.stack([link_probes(x.points) for x in found.solids]),
         "pairs": np.concatenate([found.pairs, found.pairs[:, ::-1]]).reshape(-1, 2),
     }

@@ -1,12 +1,11 @@
 """The force-based surface matching energy with barriers, term by term."""
 
-import math
 from typing import NamedTuple
 
 import torch
 
 from lgrasp.refine.links import Intrusions
-from lgrasp.refine.params import LENGTH, LIMIT_SHARE, STEEPEST, LocalSearch
+from lgrasp.refine.params import LENGTH, LIMIT_SHARE, PARABOLA_BEND, PARABOLA_SLOPE, STEEPEST, LocalSearch
 
 
 class Matches(NamedTuple):
@@ -50,13 +49,9 @@ def barrier(u: torch.Tensor) -> torch.Tensor:
     Below a tenth it continues as the parabola of the same value, slope and curvature, so that points inside are pushed
     out the harder the deeper they are.
     """
-    a = STEEPEST
-    log = math.log(a)
-    slope = -2 * (a - 1) * log - (a - 1) ** 2 / a
-    bend = -2 * log - 4 * (a - 1) / a + (a - 1) ** 2 / a**2
-    inside = u.clamp(a, 1.0)
-    v = (u - a).clamp_max(0)
-    return -((inside - 1) ** 2) * inside.log() + slope * v + 0.5 * bend * v * v
+    inside = u.clamp(STEEPEST, 1.0)
+    v = (u - STEEPEST).clamp_max(0)
+    return -((inside - 1) ** 2) * inside.log() + PARABOLA_SLOPE * v + 0.5 * PARABOLA_BEND * v * v
 
 
 def matching_energies(

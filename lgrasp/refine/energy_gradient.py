@@ -4,8 +4,6 @@ Every term pulls at points of bodies; a body's pulls make a force F and a moment
 frame, and these go down the joints.
 """
 
-import math
-
 import warp as wp
 
 from lgrasp.grasp.collision import plane_height
@@ -13,9 +11,10 @@ from lgrasp.math.kinematics import Kinematics
 from lgrasp.math.lanes import lanes_least, lanes_sum, meet, neighbours_sum
 from lgrasp.math.scratch import rows_of
 from lgrasp.refine.match_kernels import LINK_DEEPEST, Correspondences, Points, Solids
-from lgrasp.refine.params import LENGTH, STEEPEST
+from lgrasp.refine.params import LENGTH, PARABOLA_BEND, PARABOLA_SLOPE, STEEPEST, LocalSearch
 from lgrasp.refine.volume import Volume, turning_normal, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import params_struct
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -23,9 +22,6 @@ MAX_COLUMNS = 32
 """Most joints that a hand's postures name."""
 
 _BLOCK_LANES, _LINK_LANES = wp.constant(8), wp.constant(4)  # that work on one block of points, one link
-_LOG_STEEPEST = math.log(STEEPEST)
-_PARABOLA_SLOPE = wp.constant(-2 * (STEEPEST - 1) * _LOG_STEEPEST - (STEEPEST - 1) ** 2 / STEEPEST)
-_PARABOLA_CONSTANT = wp.constant(-2 * _LOG_STEEPEST - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2)
 
 
 @wp.struct
@@ -48,32 +44,19 @@ class DescentScratch:
 DescentScratches, scratch_of = rows_of(DescentScratch)
 
 
-@wp.struct
-class Search:
-    """Weights and sizes of the local search, scaled: see :class:`lgrasp.refine.params.LocalSearch`."""
-
-    points: wp.float32  # over the sum of all weights
-    normals: wp.float32  # the same
-    force: wp.float32  # over the square of the number of contacts
-    barrier: wp.float32
-    limits: wp.float32  # over the number of joints
-    margin: wp.float32
-    link_margin: wp.float32
-    contacts: wp.int32
-    gradient_steps: wp.int32
-    sgd: wp.int32
-    momentum: wp.float32
-    max_translation_step: wp.float32
-    max_rotation_step: wp.float32
-    max_joint_step: wp.float32
-    decay: wp.float32
-    middle: wp.vec3  # what hands are turned about, base frame [m]
-    com: wp.vec3
-    radius: wp.float32
-    lower: wp.array(dtype=wp.float32)  # (K,) [rad or m]
-    upper: wp.array(dtype=wp.float32)  # (K,) [rad or m]
-    column: wp.array(dtype=wp.int32)  # (J,) column of q that moves each joint
-    near: wp.array(dtype=wp.float32)  # (K,) distance from a limit within which it repels [rad or m]
+Search = params_struct(
+    *("Search", __name__, LocalSearch),
+    sgd=wp.int32,
+    middle=wp.vec3,  # what hands are turned about, base frame [m]
+    com=wp.vec3,
+    radius=wp.float32,
+    lower=wp.array(dtype=wp.float32),  # (K,) [rad or m]
+    upper=wp.array(dtype=wp.float32),  # (K,) [rad or m]
+    column=wp.array(dtype=wp.int32),  # (J,) column of q that moves each joint
+    near=wp.array(dtype=wp.float32),  # (K,) distance from a limit within which it repels [rad or m]
+)
+"""Weights and sizes of the local search; weights of ``points`` and ``normals`` are over the sum of all points' weights,
+``force`` over the square of the number of contacts, ``limits`` over the number of joints."""
 
 
 @wp.func
@@ -82,7 +65,7 @@ def _repulsion(u: wp.float32):
     if u >= 1.0:
         return 0.0
     if u < STEEPEST:
-        return _PARABOLA_SLOPE + _PARABOLA_CONSTANT * (u - STEEPEST)
+        return PARABOLA_SLOPE + PARABOLA_BEND * (u - STEEPEST)
     return -2.0 * (u - 1.0) * wp.log(u) - (u - 1.0) * (u - 1.0) / u
 
 

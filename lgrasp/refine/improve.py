@@ -50,51 +50,37 @@ def improve(
     Returns:
         Rows in the order given, and their outcomes (:class:`~lgrasp.grasp.outcomes.Outcome`), (n,).
     """
-    parts = [slice(first, first + _CPU_ROWS) for first in range(0, len(q), _CPU_ROWS)]
-    if search.device != "cpu" or len(parts) < 2:
-        return _improved(search, hand, obj, pose, q, bounds, tries, resting, index)
 
-    def part(p: slice) -> tuple[GraspTable, np.ndarray]:
-        plane = None if resting is None else resting[p]
-        return _improved(search, hand, obj, pose[p], q[p], bounds, tries[p], plane, index[p])
+    def improved(own: np.ndarray) -> tuple[GraspTable, np.ndarray]:
+        """The same of some of them, by index."""
+        table, outcome = None, np.full(len(own), Outcome.CONTACT)
+        for number in range(int(tries[own].max(initial=1))):
+            rows = np.flatnonzero((outcome != Outcome.KEPT) & (tries[own] > number)) if number else np.arange(len(own))
+            at = own[rows]
+            if not len(rows):
+                break
+            planes = None if resting is None else resting[at]
+            for back, joints in _looks(search, _start(search, hand, pose[at], q[at], number), number):
+                contacts = find_contacts(hand, obj, back, joints, bounds)
+                found, now = check_grasps(hand, obj, back, joints, contacts, bounds, resting=planes, index=index[at])
+                if table is None:
+                    table, outcome = found, now
+                    continue
+                passed, had = now == Outcome.KEPT, outcome[rows] == Outcome.KEPT
+                lower = found.metrics["unresisted_load"] < table.metrics["unresisted_load"][rows]
+                better = passed & (~had | lower) | (~had & (number == 0))
+                table = choose_grasps(table, found, rows[better], np.flatnonzero(better))
+                outcome[rows[better]] = now[better]
+        assert table is not None
+        return table, outcome
 
+    size = _CPU_ROWS if search.device == "cpu" else max(len(q), 1)
+    parts = np.split(np.arange(len(q)), range(size, len(q), size))
+    if len(parts) == 1:
+        return improved(parts[0])
     with ThreadPoolExecutor(cores()) as pool:
-        tables, outcomes = zip(*pool.map(part, parts), strict=True)
+        tables, outcomes = zip(*pool.map(improved, parts), strict=True)
     return join_rows(list(tables)), np.concatenate(outcomes)
-
-
-def _improved(
-    search: Descent,
-    hand: HandArrays,
-    obj: ObjectArrays,
-    pose: np.ndarray,
-    q: np.ndarray,
-    bounds: GraspBounds,
-    tries: np.ndarray,
-    resting: np.ndarray | None,
-    index: np.ndarray,
-) -> tuple[GraspTable, np.ndarray]:
-    table: GraspTable | None = None
-    outcome = np.full(len(q), Outcome.CONTACT)
-    for number in range(int(tries.max(initial=1))):
-        rows = np.flatnonzero((outcome != Outcome.KEPT) & (tries > number)) if number else np.arange(len(q))
-        if not len(rows):
-            break
-        start = _start(search, hand, pose[rows], q[rows], number)
-        for back, joints in _looks(search, start, number):
-            contacts = find_contacts(hand, obj, back, joints, bounds)
-            planes = None if resting is None else resting[rows]
-            found, now = check_grasps(hand, obj, back, joints, contacts, bounds, resting=planes, index=index[rows])
-            if table is None:
-                table, outcome = found, now
-                continue
-            passed, had = now == Outcome.KEPT, outcome[rows] == Outcome.KEPT
-            lower = found.metrics["unresisted_load"] < table.metrics["unresisted_load"][rows]
-            better = passed & (~had | lower) | (~had & (number == 0))
-            table = choose_grasps(table, found, rows[better], np.flatnonzero(better))
-            outcome[rows[better]] = now[better]
-    assert table is not None
-    return table, outcome
 
 
 def _start(search: Descent, hand: HandArrays, pose: np.ndarray, q: np.ndarray, number: int) -> Hands:

@@ -5,10 +5,8 @@ Rows are hands; everything is frozen until it is matched again (:mod:`lgrasp.ref
 
 import warp as wp
 
-from lgrasp.math.kinematics import Kinematics, group_dofs, group_forward
 from lgrasp.math.lanes import lanes_before, lanes_count, lanes_least, lanes_max, lanes_sum, meet
-from lgrasp.math.limits import MAX_JOINTS
-from lgrasp.math.sdf import Sdf, sdf_far, sdf_gradient, sdf_part, sdf_value
+from lgrasp.math.sdf import Grids, Sdf, sdf_far, sdf_gradient, sdf_of, sdf_value
 from lgrasp.refine.volume import Volume, volume_at
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -45,11 +43,7 @@ class Solids:
 
     body: wp.array(dtype=wp.int32)  # (S,)
     ball: wp.array(dtype=wp.vec4)  # (S,) body's frame [m]
-    grid_first: wp.array(dtype=wp.int32)  # (S,)
-    grid_shape: wp.array(dtype=wp.vec3i)  # (S,)
-    grid_origin: wp.array(dtype=wp.vec3)  # (S,) [m]
-    grid_inv_cell: wp.array(dtype=wp.float32)  # (S,) [1/m]
-    grid_values: wp.array(dtype=wp.float32)  # (cells of all grids,) [m]
+    grids: Grids  # S of them
     points: wp.array2d(dtype=wp.vec3)  # (S, 32) that other links are probed with, body's frame [m]
     pairs: wp.array(dtype=wp.vec2i)  # (Q,)
 
@@ -69,30 +63,6 @@ class Correspondences:
     link_pair: wp.array2d(dtype=wp.int32)  # (N, Q)
     link_deep: wp.array2d(dtype=wp.vec3)  # (N, Q * LINK_DEEPEST) points of links, their bodies' frames [m]
     link_plane: wp.array2d(dtype=wp.vec4)  # (N, Q * LINK_DEEPEST) of the other link, its body's frame
-
-
-@wp.kernel
-def place_bodies(
-    h: Kinematics,
-    pose: wp.array(dtype=wp.transform),
-    q: wp.array2d(dtype=wp.float32),
-    body_out: wp.array2d(dtype=wp.transform),
-):
-    """Bodies of hands in the object's frame; launched over hands.
-
-    Args:
-        pose: T_object_hand, (N,).
-        q: [rad or m], (N, K).
-        body_out: T_object_body, (N, B).
-    """
-    row = wp.tid()
-    X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
-    T = pose[row]
-    body_out[row, 0] = T
-    for g in range(h.groups):
-        first = group_forward(h, g, group_dofs(h, g, q, row), X, 0)
-        for j in range(h.joint_first[g + 1] - first):
-            body_out[row, 1 + first + j] = T * X[j]
 
 
 @wp.func
@@ -226,11 +196,6 @@ def choose_contacts(
 
 
 @wp.func
-def _grid(s: Solids, i: wp.int32):
-    return sdf_part(s.grid_values, s.grid_first[i], s.grid_shape[i], s.grid_origin[i], s.grid_inv_cell[i])
-
-
-@wp.func
 def _link_plane(grid: Sdf, p: wp.vec3):
     return _plane(sdf_gradient(grid, p), p)
 
@@ -260,7 +225,7 @@ def match_solids(
     back = wp.transform_inverse(T)
     centre = _centre(s, i, T)
     radius = s.ball[i][3] + margin
-    grid = _grid(s, i)
+    grid = sdf_of(s.grids, i)
     depth = _vec_deep(_FAR_DISTANCE)
     which = _veci_deep(0)
     for k in range(cloud.shape[0]):
@@ -308,7 +273,7 @@ def match_links(
             reach = s.ball[a][3] + s.ball[b][3] + margin
             if wp.length_sq(centre - _centre(s, b, B)) < reach * reach:
                 inside = wp.transform_point(wp.transform_inverse(B), centre)
-                if not sdf_far(_grid(s, b), inside, s.ball[a][3] + margin):
+                if not sdf_far(sdf_of(s.grids, b), inside, s.ball[a][3] + margin):
                     meets = 1
         place = near + lanes_before(meets)
         if meets == 1:
@@ -321,7 +286,7 @@ def match_links(
         a = s.pairs[pair][0]
         b = s.pairs[pair][1]
         T = wp.transform_inverse(body[row, s.body[b]]) * body[row, s.body[a]]
-        grid = _grid(s, b)
+        grid = sdf_of(s.grids, b)
         depth = wp.vec2(_FAR_DISTANCE, _FAR_DISTANCE)
         which = wp.vec2i(_NONE, _NONE)
         for k in range(lane, s.points.shape[1], lanes):

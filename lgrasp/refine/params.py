@@ -1,5 +1,6 @@
 """Parameters of the local search and its energy; lengths in metres, angles in radians."""
 
+import math
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -9,7 +10,11 @@ from lgrasp.config import Params
 LENGTH = 0.01
 """The energy counts distances in this unit [m]."""
 STEEPEST = 0.1
-"""Share of the margin below which a barrier continues as a parabola."""
+"""Share of the margin below which a barrier continues as a parabola of the same value, slope and curvature."""
+_LOG = math.log(STEEPEST)
+PARABOLA_SLOPE = -2 * (STEEPEST - 1) * _LOG - (STEEPEST - 1) ** 2 / STEEPEST
+PARABOLA_BEND = -2 * _LOG - 4 * (STEEPEST - 1) / STEEPEST + (STEEPEST - 1) ** 2 / STEEPEST**2
+"""Slope and curvature there."""
 LIMIT_SHARE = 0.15
 """Joint limits repel within this share of the range."""
 

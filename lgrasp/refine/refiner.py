@@ -134,7 +134,8 @@ class Refiner(nn.Module):
             def search(part: Pose) -> Pose:
                 at = self._put(part)
                 fast.run(at, rounds=rounds, first=first)
-                return self._taken(at, t.dtype)
+                base, q = (torch.as_tensor(x, dtype=t.dtype, device=self._device) for x in at.arrays())
+                return Pose(*motion_from_pose(base), q)
 
             workers = torch.get_num_threads() if self._device.type == "cpu" else 1
             parts = zip(*(x.chunk(workers) for x in given), strict=True)
@@ -172,10 +173,6 @@ class Refiner(nn.Module):
     def _put(self, pose: Pose) -> Hands:
         base = pose_from_motion(pose.R, pose.t)
         return Hands.put(base.cpu().numpy(), pose.q.cpu().numpy(), self.search.device)
-
-    def _taken(self, at: Hands, dtype: torch.dtype) -> Pose:
-        base, q = (torch.as_tensor(x, dtype=dtype, device=self._device) for x in at.arrays())
-        return Pose(*motion_from_pose(base), q)
 
     def unrolled(
         self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, steps: int = 5, matches: Matches | None = None

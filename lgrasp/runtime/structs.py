@@ -23,6 +23,21 @@ def make_struct(kind: Any, *sources: object, **values: Any) -> Any:
     return struct
 
 
+def params_struct(name: str, module: str, *models: Any, floats: str = "", **others: Any) -> Any:
+    """A Warp struct of the numbers of parameters, which are called and told of as in the models that declare them.
+
+    Args:
+        name, module: of the struct.
+        models: pydantic models; flags become 1 or 0, and what is no number is left out.
+        floats: names of further numbers, such as bounds. others: types of further fields.
+    """
+    kinds = {float: wp.float32, int: wp.int32, bool: wp.int32}
+    fields = {n: f.annotation for model in models for n, f in model.model_fields.items()}
+    types = {n: kinds[kind] for n, kind in fields.items() if kind in kinds}
+    types |= dict.fromkeys(floats.split(), wp.float32) | others
+    return wp.struct(type(name, (), {"__module__": module, "__qualname__": name, "__annotations__": types}))
+
+
 def upload_struct(kind: Any, device: str, values: Mapping[str, Any]) -> Any:
     """A Warp struct whose fields are copied to a device with the types that it declares.
 

@@ -11,7 +11,7 @@ import warp as wp
 from lgrasp.field.arrays import FieldArrays
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.held import HeldArrays, hold_nothing
-from lgrasp.grasp.predicted import PredictedArrays
+from lgrasp.grasp.predicted import Predicted
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
 from lgrasp.policy.arrays import PolicyArrays, upload_policy
@@ -41,7 +41,7 @@ class Context:
     holding: HeldArrays | None = None
     """What the hand holds already, what of it may not move, and the opposition spaces that grasps must use, which are
     the contact surfaces of hand and field then; None: nothing."""
-    predicted: PredictedArrays | None = None
+    predicted: "Predicted | None" = None
     """Poses and postures of the candidates in opposition spaces; None: they are drawn."""
     steer: SteerArrays | None = None
     """What the user asks of grasps; None: nothing."""

@@ -13,11 +13,7 @@ ALIASES = {"firm": "robust"}
 STAGE_ALIASES = {"validate": "simulate"}
 """Old name of a stage -> its name."""
 
-_MEASURES = {
-    "friction": "friction",
-    "torque_scale": "torque_scale",
-    "disturbance": "max_unresisted_load",
-}
+_MEASURES = {"friction": "friction", "torque_scale": "torque_scale", "disturbance": "max_unresisted_load"}
 _CHECKS = _MEASURES | {
     "penetration": "max_penetration",
     "self_margin": "min_self_distance",

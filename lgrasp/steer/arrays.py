@@ -7,7 +7,7 @@ import warp as wp
 
 from lgrasp.geometry.poses import internal_poses
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.hand.palm import palm_axis
+from lgrasp.hand.contact_surface import palm_axis
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
 from lgrasp.steer.params import NOTHING, Steering

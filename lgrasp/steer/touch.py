@@ -8,9 +8,9 @@ import numpy as np
 
 from lgrasp.config import did_you_mean
 from lgrasp.errors import ConfigError
+from lgrasp.hand.contact_surface import palm_axis
 from lgrasp.hand.fingers import finger_group, finger_label
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.palm import palm_axis
 from lgrasp.steer.params import Steering
 
 MOST_POSES = 4096
@@ -113,10 +113,10 @@ def _links(names: Sequence[str], model: HandModel) -> list[int]:
 def _groups(names: Sequence[str], model: HandModel, fingers: Fingers) -> list[int]:
     """Groups of fingers with contact surface by their names or those of links, each once."""
     able = np.flatnonzero(np.diff(model.contact_first[:-1])).tolist()
-    known = [finger_label(model, fingers, g) for g in able]
+    known = [finger_label(model.tree, fingers, g) for g in able]
     found: dict[int, str] = {}
     for name in names:
-        group = finger_group(model, fingers, name)
+        group = finger_group(model.tree, fingers, name)
         if group not in able:
             raise ConfigError(
                 f"steer.fingers: hand '{model.name}' has no finger '{name}' that may touch; "

@@ -8,9 +8,8 @@ from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError
 from lgrasp.hand.fingers import Roles, finger_roles
 from lgrasp.hand.params import LinkSide, ThumbBend
-from lgrasp.hand.sides import LinkSides, finger_sides
+from lgrasp.hand.sides import LinkSides, finger_sides, thumb_bends
 from lgrasp.hand.spec import HandSpec
-from lgrasp.hand.thumb import thumb_bends
 from lgrasp.hand.tree import Tree
 from lgrasp.hand.urdf import Urdf
 from lgrasp.steer.grasp_types import GraspType, find_type, read_types

@@ -156,7 +156,7 @@ def test_valid_grasps_are_valid_as_they_are(inputs, table):
     pipeline, view = small_pipeline(), inputs.view
     pose, q, free = table.pose[:, 0], table.q[:, 0], table.free[:, 0]
     context = in_spaces(inputs, table, q)
-    there = upload_predicted(view.hand, context.object, context.held, view.records, pose, q).struct
+    there = upload_predicted(view.hand, context.object, context.held, view.records, pose, q)
     grasps = TouchingGrasps(pose, q, *fetch([there.hand_point, there.object_point]))
     found = run_stage("filter", touching_sets(grasps, context), pipeline, context, Meter("cpu"))
     at = found.index

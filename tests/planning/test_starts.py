@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import HandError
 from lgrasp.hand.arrays import upload_hand
-from lgrasp.hand.contact_surface import contact_surface
-from lgrasp.hand.palm import palm_axis
+from lgrasp.hand.contact_surface import contact_surface, palm_axis
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.planning.params import PlanParams
 from lgrasp.planning.planner import Planner

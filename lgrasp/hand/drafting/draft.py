@@ -59,7 +59,10 @@ def draft_spec(
     tree, names = survey.model.tree, finger_names(structure)
     low, high = np.round(survey.hold.low, 3), np.round(survey.hold.high, 3)
     opened, clear = _open_posture(survey)
-    group = structure.tree.body_group
+    group, palm = structure.tree.body_group, {}
+    if survey.palm:
+        cone = {"axis": rounded_axis(survey.palm[0].axis), "angle": 45.0}
+        palm = {"links": [side.samples.link for side in survey.palm], "allowed": [cone]}
     data: dict[str, Any] = {
         "name": name,
         "urdf": urdf_path.name,
@@ -67,7 +70,7 @@ def draft_spec(
         "locked": survey.locked,
         "static_links": tree.links_on(0),
         "contact": _contact_rules(survey),
-        "palm": _palm_rule(survey),
+        "palm": palm,
         "canonical_box": {"min": low.tolist(), "max": high.tolist()},
         "open_posture": opened,
         "fingers": {
@@ -254,13 +257,6 @@ def _contact_rules(survey: ContactSurvey) -> list[dict[str, Any]]:
         {"links": links, "forbidden": [{"axis": list(cone[:3]), "angle": cone[3]} for cone in cones]}
         for cones, links in rules.items()
     ]
-
-
-def _palm_rule(survey: ContactSurvey) -> dict[str, Any]:
-    if not survey.palm:
-        return {}
-    links = [side.samples.link for side in survey.palm]
-    return {"links": links, "allowed": [{"axis": rounded_axis(survey.palm[0].axis), "angle": 45.0}]}
 
 
 def _say_contacts(survey: ContactSurvey, names: list[str]) -> list[str]:

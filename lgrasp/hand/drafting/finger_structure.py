@@ -7,9 +7,10 @@ from functools import cached_property
 import numpy as np
 
 from lgrasp.errors import HandError
+from lgrasp.hand.links import joints_above
 from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.hand.tree import Tree, build_tree
-from lgrasp.hand.urdf import Joint, Urdf
+from lgrasp.hand.urdf import Urdf
 
 MAX_FINGERS = 6
 """Most parts of a hand that move by themselves."""
@@ -102,7 +103,7 @@ def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerS
             "joints that are no fingers fixed"
         )
     base = _common_link(urdf, structure)
-    above = [j.name for j in _joints_above(urdf, base)]
+    above = [j.name for j in joints_above(urdf.joints, base)]
     carrying = tuple(n for n in locked if n in above)
     return replace(structure, base_link=base if carrying else None, locked=tuple(locked), carrying=carrying)
 
@@ -133,23 +134,13 @@ def _shared_joint(structure: FingerStructure) -> str | None:
     return best
 
 
-def _joints_above(urdf: Urdf, link: str) -> list[Joint]:
-    """Joints from a link up to the root."""
-    into = {j.child: j for j in urdf.joints}
-    found = []
-    while link in into:
-        found.append(into[link])
-        link = into[link].parent
-    return found
-
-
 def _common_link(urdf: Urdf, structure: FingerStructure) -> str:
     """The deepest link that carries all fingers."""
     tree = structure.tree
     static, lines = set(tree.links_on(0)), []
     for tip in structure.tips:
         first = tree.links_on(tree.path(tip)[0])[0]
-        lines.append([j.parent for j in reversed(_joints_above(urdf, first)) if j.parent in static])
+        lines.append([j.parent for j in reversed(joints_above(urdf.joints, first)) if j.parent in static])
     return [links[0] for links in zip(*lines, strict=False) if len(set(links)) == 1][-1]
 
 

@@ -19,7 +19,6 @@ from lgrasp.files import new_folder, temporary_folder
 from lgrasp.geometry.mesh_files import mesh_bytes
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.digest import hand_digest
-from lgrasp.hand.drafting.couplings import left_out_couplings
 from lgrasp.hand.drafting.cut_hand import cut_hand, hand_roots
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.mjcf import mjcf_to_urdf
@@ -28,12 +27,13 @@ from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, read_mesh, thin_mesh
 from lgrasp.hand.names import name_of_file, slug
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
-from lgrasp.hand.urdf import check_robot, find_mesh, is_mjcf, read_robot
-from lgrasp.paths import cache_dir, user_dir
+from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, read_robot
+from lgrasp.paths import cache_dir, data_dirs, user_dir
 
 _DRAFT_VERSION = 5
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
+_MOST_OTHERS = 30  # files that are asked for couplings
 
 
 @dataclass(frozen=True)
@@ -84,11 +84,8 @@ def import_urdf(
             raise HandError(
                 f"hand folder {folder} exists; choose another --name or --out, or replace it with --overwrite"
             )
-        if (
-            folder.exists()
-            and not (folder / "hand.yaml").is_file()
-            and any(folder.iterdir() if folder.is_dir() else [1])
-        ):
+        no_hand = folder.exists() and not (folder / "hand.yaml").is_file()
+        if no_hand and not (folder.is_dir() and next(folder.iterdir(), None) is None):
             raise HandError(f"{folder} holds something that is no hand (it has no hand.yaml); choose another --out")
         originals: dict[Path, Path] = {}
         try:
@@ -143,15 +140,14 @@ def _fill(
     changes += _take_meshes(robot, folder, find, originals)
     target = folder / "hand.urdf"
     _write(robot, target)
-    jaws = find_jaws(target)
-    if jaws is not None:
+    if jaws := find_jaws(target):
         reroot(robot, jaws[0])
         _write(robot, target)
         changes.append(
             f"one drive moves both jaws: '{jaws[0]}' is made the base (the copy of the URDF is turned round; joint "
             f"values mean the same), so that '{jaws[1]}' closes against it as against a palm"
         )
-    changes += left_out_couplings(file, robot)
+    changes += _left_out_couplings(file, robot)
     spec, decided = draft_spec(target, name, jaws=jaws)
     spec = spec.model_copy(update={"source": f"drafted by lgrasp hands add from {file.name}"})
     changes += decided
@@ -159,6 +155,31 @@ def _fill(
     written = load_spec(folder / "hand.yaml")
     build_hand(target, written)
     return written, changes
+
+
+def _left_out_couplings(urdf: Path, robot: etree._Element) -> list[str]:
+    """Couplings that a file leaves out, at most one line: joints without <mimic> that another URDF of the folder, or a
+    shipped one, couples; all joints of that URDF are joints of this ``robot``."""
+    names, coupled = _joints(robot)
+    beside = (path for path in sorted(urdf.parent.glob("*.urdf")) if path.name != urdf.name)
+    shipped = sorted(data_dirs("hands")[-1].glob("*/hand.urdf"))
+    for other in itertools.islice(itertools.chain(shipped, beside), _MOST_OTHERS):
+        try:
+            its_names, its_coupled = _joints(read_robot(other)[0])
+        except HandError:
+            continue
+        if its_names <= names and (missing := sorted(its_coupled - coupled)):
+            return [
+                f"note: this file does not couple {', '.join(missing)}, which {other} does: if they have no drive of "
+                "their own, say so (mimic)"
+            ]
+    return []
+
+
+def _joints(robot: etree._Element) -> tuple[set[str], set[str]]:
+    """Names of the joints that move, and of those that mimic another."""
+    moving = [joint for joint in robot.iter("joint") if joint.get("type") in MOVABLE]
+    return {j.get("name", "") for j in moving}, {j.get("name", "") for j in moving if j.find("mimic") is not None}
 
 
 def _write(robot: etree._Element, path: Path) -> None:

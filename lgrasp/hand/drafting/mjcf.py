@@ -196,13 +196,8 @@ class _Writer:
         elif kind == kinds.mjGEOM_ELLIPSOID:
             mesh = trimesh.creation.icosphere(subdivisions=3).apply_scale(size)
         else:
-            vertices, faces = (
-                getattr(m, f"mesh_{what}")[first : first + count]
-                for what, first, count in (
-                    ("vert", m.mesh_vertadr[data], m.mesh_vertnum[data]),
-                    ("face", m.mesh_faceadr[data], m.mesh_facenum[data]),
-                )
-            )
+            v, f = m.mesh_vertadr[data], m.mesh_faceadr[data]
+            vertices, faces = m.mesh_vert[v : v + m.mesh_vertnum[data]], m.mesh_face[f : f + m.mesh_facenum[data]]
             mesh = trimesh.Trimesh(vertices, faces, process=False)
         file = f"{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}.stl"
         while (self._folder / file).exists():
@@ -229,11 +224,10 @@ class _Writer:
             follows = self._follows.get(j)
             if follows and follows.source is None:
                 step += follows.offset
-            xyz, turn = (
-                (xyz + turn.apply(step * axis), turn)
-                if kind == self._sliding
-                else (xyz, turn * Rotation.from_rotvec(step * axis))
-            )
+            if kind == self._sliding:
+                xyz = xyz + turn.apply(step * axis)
+            else:
+                turn = turn * Rotation.from_rotvec(step * axis)
             last = j == joints[-1] and not anchor.any()
             child = self._name("body", b) if last else self._new(f"{name}_link")
             if not last:
@@ -260,9 +254,8 @@ class _Writer:
         if sliding and not limited:
             more = "" if self._root else "; of a scene, take what one body carries: --root BODY"
             raise HandError(f"slide joint '{name}' has no range; give it one [m]{more}")
-        joint = _connect(
-            robot, name, "prismatic" if sliding else "revolute" if limited else "continuous", links, origin
-        )
+        kind = "prismatic" if sliding else "revolute" if limited else "continuous"
+        joint = _connect(robot, name, kind, links, origin)
         etree.SubElement(joint, "axis", xyz=number_text(m.jnt_axis[j]))
         limit = etree.SubElement(joint, "limit")
         if limited:
@@ -271,14 +264,9 @@ class _Writer:
         if (effort := self._effort(j)) is not None:
             limit.set("effort", number_text([effort]))
         if follows and follows.source is not None:
-            source = self._name("joint", follows.source)
-            etree.SubElement(
-                joint,
-                "mimic",
-                joint=source,
-                multiplier=number_text([follows.multiplier]),
-                offset=number_text([follows.offset]),
-            )
+            mimic = etree.SubElement(joint, "mimic", joint=self._name("joint", follows.source))
+            mimic.set("multiplier", number_text([follows.multiplier]))
+            mimic.set("offset", number_text([follows.offset]))
 
     def _effort(self, j: int) -> float | None:
         """Largest force or torque of a joint's actuators [N or N m]; None: not limited."""

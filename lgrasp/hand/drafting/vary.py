@@ -87,7 +87,7 @@ def _joint_limit(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpec, 
 
 
 def _link_scale(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpec, factor: float) -> HandSpec:
-    moving = _moving_links(tree)
+    moving = set(tree.link_names) - set(tree.links_on(0))
     for link in robot.findall("link"):
         if link.get("name") not in moving:
             continue
@@ -109,7 +109,8 @@ def _link_scale(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpec, f
         if parent is not None and parent.get("link") in moving:
             _scale(joint.find("origin"), "xyz", factor)
     middle = np.mean(list(_mounts(urdf, tree).values()), axis=0)
-    low, high = (tuple((middle + factor * (np.asarray(end) - middle)).tolist()) for end in _ends(spec.canonical_box))
+    ends = (spec.canonical_box.min, spec.canonical_box.max)
+    low, high = (tuple((middle + factor * (np.asarray(end) - middle)).tolist()) for end in ends)
     spaces = {
         name: OppositionSpace(joints=space.joints, sides=tuple(_grown(s, moving, factor) for s in space.sides))
         for name, space in spec.opposition_spaces.items()
@@ -141,15 +142,11 @@ _CHANGES: dict[str, Callable[[etree._Element, Urdf, Tree, HandSpec, float], Hand
 }
 
 
-def _moving_links(tree: Tree) -> set[str]:
-    return {name for name, body in zip(tree.link_names, tree.link_body, strict=True) if body > 0}
-
-
 def _mounts(urdf: Urdf, tree: Tree) -> dict[str, np.ndarray]:
     """Positions (3,) [m] of the joints by which moving links are mounted on the base, in its frame."""
-    moving, found = _moving_links(tree), {}
+    static, found = tree.links_on(0), {}
     for joint in urdf.joints:
-        if joint.child in moving and joint.parent not in moving and joint.parent in tree.link_names:
+        if joint.child not in static and joint.parent in static:
             T = tree.T_body_link[tree.link_names.index(joint.parent)] @ joint.T_parent_joint
             found[joint.name] = T[:3, 3]
     return found
@@ -161,14 +158,10 @@ def _grown(side: tuple[Surface, ...], moving: set[str], factor: float) -> tuple[
     for part in side:
         box = part.box
         if box is not None and part.links[0] in moving:
-            low, high = (tuple((factor * np.asarray(end)).tolist()) for end in _ends(box))
+            low, high = (tuple((factor * np.asarray(end)).tolist()) for end in (box.min, box.max))
             box = Box(min=low, max=high)
         found.append(part.model_copy(update={"box": box}))
     return tuple(found)
-
-
-def _ends(box: Box) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return box.min, box.max
 
 
 def _scale(element: etree._Element | None, key: str, factor: float) -> None:

@@ -42,33 +42,19 @@ def hand_spaces(spec: HandSpec, tree: Tree) -> tuple[Space, ...]:
     return tuple(out)
 
 
-def free_joints(space: Space, used: np.ndarray) -> np.ndarray:
-    """Joints that a step with a space moves: those of the space that no earlier step moved, (K,) bool.
-
-    Args:
-        used: joints that earlier steps moved, (K,) bool.
-    """
-    return space.joints & ~np.asarray(used, bool)
-
-
 def available(spaces: Sequence[Space], used_spaces: Collection[int], used_joints: np.ndarray) -> list[int]:
-    """Spaces that may come next: not used yet, and with a joint left to move.
+    """Spaces that may come next: not used yet, and with a joint left to move, which no earlier step moved.
 
     Args:
-        used_spaces: indices in ``spaces``. used_joints: (K,) bool.
+        used_spaces: indices in ``spaces``. used_joints: those that earlier steps moved, (K,) bool.
     """
-    return [i for i, s in enumerate(spaces) if i not in used_spaces and free_joints(s, used_joints).any()]
-
-
-def consumed(spaces: Sequence[Space], used_spaces: Collection[int], used_joints: np.ndarray) -> bool:
-    """True if no space is left for another object."""
-    return not available(spaces, used_spaces, used_joints)
+    return [i for i, s in enumerate(spaces) if i not in used_spaces and (s.joints & ~used_joints).any()]
 
 
 def longest(spaces: Sequence[Space], used_spaces: Collection[int], used_joints: np.ndarray) -> int:
     """The largest number of further objects that could follow, whatever the order; see :func:`available`."""
     masks = {_bits(s.joints) for i, s in enumerate(spaces) if i not in used_spaces}
-    return _longest(tuple(sorted(masks)), _bits(np.asarray(used_joints, bool)))
+    return _longest(tuple(sorted(masks)), _bits(used_joints))
 
 
 def _bits(mask: np.ndarray) -> int:
@@ -97,7 +83,7 @@ def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = 
         points, normals, area = side_points(meshes[link], around, T, surface, rng, device)
         if len(points):
             rules = body_cones(_outside(surface) if group >= 0 else (), T)
-            found.append(ContactLink(link, group if group >= 0 else tree.groups, points, normals, rules, area))
+            found.append(ContactLink(link, tree.surface_of(link), points, normals, rules, area))
     return tuple(found)
 
 

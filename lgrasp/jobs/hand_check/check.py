@@ -143,7 +143,7 @@ def check_spaces(inputs: Inputs) -> list[SpaceCheck]:
     urdf, postures = read_urdf(inputs.keys.source.urdf), space_postures(model, device)
     out = []
     for space in hand_spaces(spec, model.tree):
-        labels = [finger_label(model, dict(spec.fingers), g) if g >= 0 else "palm" for g in space.groups]
+        labels = [finger_label(model.tree, dict(spec.fingers), g) if g >= 0 else "palm" for g in space.groups]
         joints = list(spec.opposition_spaces[space.name].joints)
         try:
             sides = space_sides(urdf, spec, model.tree, space.name, device)

@@ -61,7 +61,7 @@ def _touches(model: HandModel, field: ContactField) -> list[Touch]:
 def hand_findings(model: HandModel, field: ContactField, names: dict[str, tuple[str, ...]]) -> dict[str, list[str]]:
     """Problems of a hand's rules, by the stage that loses the grasps."""
     found: dict[str, list[str]] = {"place": [], "domain": [], "ik": [], "search": [], "filter": []}
-    label = [finger_label(model, names, g) for g in range(model.groups)]
+    label = [finger_label(model.tree, names, g) for g in range(model.groups)]
     low, high = model.canonical_box
     points = low + np.random.default_rng(0).random((400, 3)) * (high - low)
     usable = [g for g in range(model.groups) if model.contact_first[g + 1] > model.contact_first[g]]

@@ -56,7 +56,7 @@ def _draw_sides(inputs: Inputs, path: Path, paint: _Paint, clouds: list[np.ndarr
     """The open hand from two sides with its canonical box and a cloud of dots for each finger."""
     model, hand = inputs.hand.model, _Hand(inputs)
     names = dict(inputs.keys.source.spec.fingers)
-    key = [(finger_label(model, names, g), _COLOURS[g % len(_COLOURS)]) for g in range(model.groups)]
+    key = [(finger_label(model.tree, names, g), _COLOURS[g % len(_COLOURS)]) for g in range(model.groups)]
     dots = [Painted(balls(c, _DOT, 0), colour) for c, (_, colour) in zip(clouds, key, strict=False) if len(c)]
     if model.contact_first[-1] > model.contact_first[-2]:
         key.append(("palm", _PALM))

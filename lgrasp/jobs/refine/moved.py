@@ -13,9 +13,9 @@ from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome, failed_bounds
 from lgrasp.grasp.records import GraspRows, padded
-from lgrasp.grasp.rows import CONTACTS, POSTURES, grasp_rows, press
+from lgrasp.grasp.rows import POSTURES, grasp_rows, press
 from lgrasp.grasp.schema import GRASP_FIELDS
-from lgrasp.grasp.tables import GraspTable, choose_grasps, join_rows, widen_grasps
+from lgrasp.grasp.tables import CONTACTS, GraspTable, choose_grasps, join_rows, widen_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays, upload_object

@@ -175,7 +175,7 @@ class _Step:
         context = self._context(able, space[able], 1, self.seed)
         if self.params.method == "diffuser":
             drawn = self._drawn(able, context.held, 1, 0)
-            found = upload_predicted(view.hand, context.object, context.held, view.records, *drawn).struct
+            found = upload_predicted(view.hand, context.object, context.held, view.records, *drawn)
             grasps = TouchingGrasps(*drawn, *fetch([found.hand_point, found.object_point]))
         else:
             grasps = self._optimised(able, context.held)

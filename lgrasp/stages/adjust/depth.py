@@ -4,10 +4,10 @@ import warp as wp
 
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.grasp.structs import Candidates
-from lgrasp.hand.arrays import Hand, hand_grid
+from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_JOINTS
-from lgrasp.math.sdf import sdf_below, sdf_gradient, sdf_value
+from lgrasp.math.sdf import sdf_below, sdf_gradient, sdf_of, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.adjust.structs import Adjusted, AdjustValues, Deepest, Progress
@@ -57,7 +57,7 @@ def _deepest_obstacle(
                 grid = hand.piece_grid[piece]
                 if grid < 0 or (piece > first and hand.piece_grid[piece - 1] == grid):
                     continue
-                sdf = hand_grid(hand.contacts, grid)
+                sdf = sdf_of(hand.contacts.grids, grid)
                 if sdf_below(sdf, p, s[3] - found.depth):
                     for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                         x = wp.transform_point(T_body, obj.obstacles[i])

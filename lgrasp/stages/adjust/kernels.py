@@ -6,11 +6,11 @@ import warp as wp
 
 from lgrasp.field.arrays import Field
 from lgrasp.grasp.structs import Candidates, Sets, State
-from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid, thumb_placed
+from lgrasp.hand.arrays import Hand, contact_allowed, thumb_placed
 from lgrasp.math.cholesky import solving
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column
 from lgrasp.math.limits import DOF_SIZES, MAX_GROUPS, MAX_JOINTS
-from lgrasp.math.sdf import sdf_gradient
+from lgrasp.math.sdf import sdf_gradient, sdf_of
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.adjust.depth import deepest_of
@@ -49,7 +49,7 @@ def _touch_at(hand: Hand, k: wp.int32):
 def _slid(hand: Hand, grid: wp.int32, touch: FaceContact, target: wp.vec3):
     """The contact after it slid to the point of the link nearest to ``target`` (body frame), as long as that lies on
     the same face."""
-    e = sdf_gradient(hand_grid(hand.contacts, grid), target)
+    e = sdf_gradient(sdf_of(hand.contacts.grids, grid), target)
     out = wp.vec3(e[0], e[1], e[2])
     touch.beside = 1
     if wp.dot(out, touch.out) > _SAME_FACE:

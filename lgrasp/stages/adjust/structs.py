@@ -4,6 +4,9 @@ from enum import IntEnum
 
 import warp as wp
 
+from lgrasp.runtime.structs import params_struct
+from lgrasp.stages.adjust.params import AdjustParams
+
 
 class Progress(IntEnum):
     """What has become of a set."""
@@ -20,26 +23,8 @@ class AdjustCount(IntEnum):
     KEPT = 1
 
 
-@wp.struct
-class AdjustValues:
-    """AdjustParams and GraspBounds as kernels read them."""
-
-    iterations: wp.int32
-    patience: wp.int32
-    lever: wp.float32  # [m]
-    normal_weight: wp.float32
-    slide_weight: wp.float32
-    depth_weight: wp.float32
-    left_penetration: wp.float32  # [m]
-    damping: wp.float32
-    object_damping: wp.float32
-    step: wp.float32  # [rad or m]
-    object_step: wp.float32  # [m]
-    object_turn: wp.float32  # [rad]
-    contact_indentation: wp.float32  # [m]
-    gap: wp.float32  # [m]
-    cosine: wp.float32  # least, of the normals
-    max_penetration: wp.float32  # [m]
+AdjustValues = params_struct("AdjustValues", __name__, AdjustParams, floats="cosine max_penetration")
+"""AdjustParams and GraspBounds as kernels read them; ``cosine``: least of the normals; ``object_turn`` is in [rad]."""
 
 
 @wp.struct

@@ -14,6 +14,8 @@ from lgrasp.math.kinematics import group_forward
 from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import params_struct
+from lgrasp.stages.domain.params import DomainParams
 from lgrasp.steer.arrays import may_touch
 
 wp.set_module_options(KERNEL_OPTIONS)
@@ -31,19 +33,14 @@ class DomainCount(IntEnum):
     CANDIDATES = 2
 
 
-@wp.struct
-class DomainValues:
-    """DomainParams as kernels read them."""
-
-    attempts: wp.int32
-    keep: wp.int32
-    cosine: wp.float32  # least, of hand and object normal
-    fingers: wp.int32
-    stride: wp.int32  # coprime to the number of contact points: multiples of it visit every one
-    min_table_distance: wp.float32  # [m]
-    groups: wp.int32  # bit g: group g may touch
-    round: wp.int32  # 0: the first time
-    enough: wp.int32
+DomainValues = params_struct(
+    *("DomainValues", __name__, DomainParams),
+    floats="cosine min_table_distance",
+    groups=wp.int32,  # bit g: group g may touch
+    round=wp.int32,  # 0: the first time
+    stride=wp.int32,  # coprime to the number of contact points: multiples of it visit every one
+)
+"""DomainParams and GraspBounds as kernels read them; ``cosine``: least of hand and object normal."""
 
 
 @wp.func

@@ -53,8 +53,8 @@ def run(inputs: PoseTable | CandidateTable, params: DomainParams, context: Conte
     )
     if context.opposed:
         wp.launch(keep_frozen, table.count.shape, [hand, context.held.struct], [table.struct], device=d)
-    if context.predicted and context.round == 0:
-        asked = [context.object.struct, context.held.struct, context.predicted.struct]
+    if context.predicted is not None and context.round == 0:
+        asked = [context.object.struct, context.held.struct, context.predicted]
         wp.launch(add_predicted, table.count.shape, [hand, *asked, params.keep], [table.struct], device=d)
     if context.round == 0:
         wp.launch(drop_poor, table.count.shape[0], [values], [table.struct, tally.device], device=d)

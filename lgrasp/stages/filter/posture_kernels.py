@@ -8,7 +8,7 @@ from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Places
 from lgrasp.grasp.collision import body_clear, body_height, resting_plane
 from lgrasp.grasp.contact_kernels import PalmarRuns
 from lgrasp.grasp.held import Held, group_fixed, with_frozen
-from lgrasp.grasp.outcomes import CONTACT, KEPT, OBJECT_COLLISION, SELF_COLLISION, UNUSED_FINGER
+from lgrasp.grasp.outcomes import Outcome
 from lgrasp.grasp.structs import FURTHER, vec_further
 from lgrasp.hand.arrays import Hand, thumb_placed
 from lgrasp.math.kinematics import clamp_dofs, group_forward, vec_dof
@@ -104,18 +104,18 @@ def place_touching(
     found_out.gap[i] = fit[0]
     found_out.facing[i] = fit[1]
     if fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
-        found_out.outcome[i] = CONTACT
+        found_out.outcome[i] = Outcome.CONTACT
         return
     for g in range(G):
         if at_out.chosen[i, g] >= 0:
             clear = hand_pairs_clear(hand, 0, g + 1, X, limits.min_self_distance)
             for f in range(G):
                 if clear and (f == g or (at_out.chosen[i, f] >= 0 and f < g) or group_fixed(hand, held, h, f)):
-                    clear = hand_pairs_clear(hand, wp.min(f, g) + 1, wp.max(f, g) + 1, X, limits.min_self_distance)
+                    clear = hand_pairs_clear(hand, f + 1, g + 1, X, limits.min_self_distance)
             if not clear:
-                found_out.outcome[i] = SELF_COLLISION
+                found_out.outcome[i] = Outcome.SELF_COLLISION
                 return
-    found_out.outcome[i] = KEPT
+    found_out.outcome[i] = Outcome.KEPT
 
 
 @wp.kernel
@@ -140,10 +140,10 @@ def fill_unused(
         seed: (1,) random seed.
     """
     i = wp.tid()
-    if found_out.outcome[i] != KEPT:
+    if found_out.outcome[i] != Outcome.KEPT:
         return
     if found_out.penetration[i] > limits.max_penetration:
-        found_out.outcome[i] = OBJECT_COLLISION
+        found_out.outcome[i] = Outcome.OBJECT_COLLISION
         return
     row = at_out.of[i]
     G = hand.kin.groups
@@ -185,17 +185,15 @@ def fill_unused(
                     clear = 0
                 for f in range(G):
                     # used fingers, those that stay, and unused ones that are placed already
-                    if f != g and (at_out.chosen[i, f] >= 0 or f < g or group_fixed(hand, held, h, f)):
-                        a = wp.min(g, f) + 1
-                        b = wp.max(g, f) + 1
-                        if clear == 1 and not hand_pairs_clear(hand, a, b, X, limits.min_self_distance):
-                            clear = 0
+                    there = f != g and (at_out.chosen[i, f] >= 0 or f < g or group_fixed(hand, held, h, f))
+                    if there and clear == 1 and not hand_pairs_clear(hand, f + 1, g + 1, X, limits.min_self_distance):
+                        clear = 0
                 if clear == 1:
                     at_out.posture[i, g] = x
                     found = 1
                     break
             if found == 0:
-                found_out.outcome[i] = UNUSED_FINGER
+                found_out.outcome[i] = Outcome.UNUSED_FINGER
                 return
 
 
@@ -235,7 +233,7 @@ def take_contacts(
         surface: (n, C) contact point of the object.
     """
     i = wp.tid()
-    if found_out.outcome[i] != KEPT:
+    if found_out.outcome[i] != Outcome.KEPT:
         return
     width = at_out.contact.shape[1]
     n = int(0)
@@ -259,4 +257,4 @@ def take_contacts(
     found_out.gap[i] = fit[0]
     found_out.facing[i] = fit[1]
     if n < limits.min_contacts or fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
-        found_out.outcome[i] = CONTACT
+        found_out.outcome[i] = Outcome.CONTACT

@@ -9,15 +9,17 @@ from lgrasp.field.arrays import Field
 from lgrasp.grasp.collision import body_clear, finger_above, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held, group_fixed
 from lgrasp.grasp.structs import Candidates, Sets, State
-from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid, thumb_placed
+from lgrasp.hand.arrays import Hand, contact_allowed, thumb_placed
 from lgrasp.hand.self_collision import group_pairs_clear
 from lgrasp.math.cholesky import solving
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column
 from lgrasp.math.limits import DOF_SIZES, MAX_JOINTS
-from lgrasp.math.sdf import sdf_gradient
+from lgrasp.math.sdf import sdf_gradient, sdf_of
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import params_struct
 from lgrasp.runtime.unrolled import unrolled
+from lgrasp.stages.ik.params import IkParams
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -33,23 +35,10 @@ class IkCount(IntEnum):
     SETS = 3
 
 
-@wp.struct
-class IkValues:
-    """IkParams and GraspBounds as kernels read them."""
-
-    iterations: wp.int32
-    lever: wp.float32  # [m]
-    normal_weight: wp.float32
-    damping: wp.float32
-    step: wp.float32  # [rad or m]
-    contact_indentation: wp.float32  # [m]
-    gap: wp.float32  # [m]
-    cosine: wp.float32  # least, of the normals
-    min_held_distance: wp.float32  # [m]
-    check_collision: wp.int32
-    allowed_penetration: wp.float32  # [m] of inner spheres
-    min_self_distance: wp.float32  # [m]
-    min_table_distance: wp.float32  # [m]
+IkValues = params_struct(
+    "IkValues", __name__, IkParams, floats="cosine allowed_penetration min_self_distance min_table_distance"
+)
+"""IkParams and GraspBounds as kernels read them; ``cosine``: least of the normals."""
 
 
 def _realising(size: int) -> Any:
@@ -92,7 +81,7 @@ def _realising(size: int) -> Any:
         normal = -wp.transform_vector(T, obj.contact_normals[s])
         c = field.point[candidates_out.record[row, g, m]]
         grid = hand.contacts.grid[c]
-        sdf = hand_grid(hand.contacts, grid)
+        sdf = sdf_of(hand.contacts.grids, grid)
         j0 = hand.kin.joint_first[g]
         body = hand.contacts.body[c] - 1 - j0
         dofs = hand.kin.dof_free[g]

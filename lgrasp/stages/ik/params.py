@@ -5,7 +5,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from lgrasp.config import Params
-from lgrasp.stages.least_squares import Damping, Gap, JointStep
+from lgrasp.stages.least_squares import Damping, Gap, Indentation, JointStep
 
 
 class IkParams(Params):
@@ -18,9 +18,7 @@ class IkParams(Params):
     normal_weight: float = Field(default=0.15, gt=0, le=10, description="Weight of the second point.")
     damping: Damping = 2e-6
     step: JointStep = 0.3
-    contact_indentation: float = Field(
-        default=0.0003, ge=0, le=0.002, description="How far the finger aims to press in at the contact."
-    )
+    contact_indentation: Indentation = 0.0003
     gap: Gap = 0.001
     angle: float = Field(default=15.0, gt=0, le=60, description="Largest angle of the normals at the contact [deg].")
     min_held_distance: float = Field(

@@ -9,9 +9,9 @@ from lgrasp.grasp.tables import PoseTable
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally
 from lgrasp.stages.context import Context
-from lgrasp.stages.place.choose import best_poses
 from lgrasp.stages.place.near_kernels import NearMoves, number_poses, propose_near
 from lgrasp.stages.place.params import PlaceParams
+from lgrasp.stages.place.stage import best_poses
 from lgrasp.stages.place.structs import PlaceValues, ProposedPoses
 
 _DISTANCE = 0.015  # [m] most that an object slides, and as much that its point of the palm moves

@@ -53,30 +53,17 @@ def find_all(
     anchor = wp.zeros(shape=(MAX_GROUPS,), dtype=wp.int32)
     for g in range(hand.kin.groups):
         anchor[g] = poses.anchor[row, g]
-    plane = resting_plane(obj, poses.pose[row], poses.resting[row])
+    T = poses.pose[row]
+    plane = resting_plane(obj, T, poses.resting[row])
+    setting = poses.setting[row]
     state = wp.rand_init(seed, row)
-    m = find_reach(
-        hand,
-        field,
-        obj,
-        samples,
-        groups,
-        poses.pose[row],
-        plane,
-        poses.setting[row],
-        anchor,
-        points,
-        normals,
-        owner,
-        share,
-        state,
-    )
+    m = find_reach(hand, field, obj, samples, groups, T, plane, setting, anchor, points, normals, owner, share, state)
     for k in range(m):
         reach_out.points[row, k] = points[k]
         reach_out.normals[row, k] = normals[k]
         reach_out.owner[row, k] = owner[k]
     for g in range(hand.kin.groups):
         reach_out.share[row, g] = share[g]
-    T_object = wp.transform_inverse(poses.pose[row])
+    T_object = wp.transform_inverse(T)
     for k in range(at.shape[0]):
         reach_out.distances[row, k] = sdf_value(obj.sdf, wp.transform_point(T_object, at[k]))

@@ -165,20 +165,7 @@ def rate_pose(
     owner = wp.zeros(shape=(MAX_HITS,), dtype=wp.int32)
     share = wp.zeros(shape=(MAX_GROUPS,), dtype=wp.float32)
     found = find_reach(
-        hand,
-        field,
-        obj,
-        params.samples,
-        groups,
-        T,
-        plane,
-        setting,
-        anchor,
-        points,
-        normals,
-        owner,
-        share,
-        state,
+        hand, field, obj, params.samples, groups, T, plane, setting, anchor, points, normals, owner, share, state
     )
     m = found
     if palm >= 0:

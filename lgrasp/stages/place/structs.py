@@ -5,6 +5,8 @@ from enum import IntEnum
 import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import params_struct
+from lgrasp.stages.place.params import PlaceParams
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -25,20 +27,10 @@ class Rating(IntEnum):
     BLOCKED = -1  # by static links, or these by the table
 
 
-@wp.struct
-class PlaceValues:
-    """PlaceParams and GraspBounds as kernels read them."""
-
-    canonical: wp.float32  # share of all proposals, as the next two
-    pinch: wp.float32
-    palm: wp.float32
-    samples: wp.int32
-    policy_temperature: wp.float32
-    max_com_distance: wp.float32  # [m]
-    allowed_penetration: wp.float32  # [m]
-    spins: wp.int32
-    min_object_distance: wp.float32  # [m]
-    min_table_distance: wp.float32  # [m]
+PlaceValues = params_struct(
+    "PlaceValues", __name__, PlaceParams, floats="allowed_penetration min_object_distance min_table_distance"
+)
+"""PlaceParams and GraspBounds as kernels read them; ``canonical``, ``pinch``, ``palm`` are shares of all proposals."""
 
 
 @wp.struct

@@ -10,7 +10,8 @@ from lgrasp.math.qp import balance
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.search.params import MAX_KINDS, MAX_RESTARTS
+from lgrasp.runtime.structs import params_struct
+from lgrasp.stages.search.params import MAX_KINDS, MAX_RESTARTS, SearchParams
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -18,30 +19,16 @@ vec_set = wp.types.vector(MAX_GROUPS, wp.int32)
 vec_kinds = wp.types.vector(MAX_KINDS, wp.int32)
 
 
-@wp.struct
-class SearchValues:
-    """SearchParams and GraspBounds as kernels read them."""
-
-    contacts: vec_kinds
-    kinds: wp.int32  # entries of ``contacts``
-    least: wp.int32  # fewest finger contacts
-    min_contacts: wp.int32  # of fingers' links and the palm
-    more: wp.int32  # contacts beyond these, where a pose has them
-    threshold: wp.float32  # of the squared residual
-    friction: wp.float32
-    max_gswo: wp.float32
-    max_unresisted_load: wp.float32
-    least_force: wp.float32
-    torque_scale: wp.float32  # [1/m]
-    moves: wp.int32
-    rounds: wp.int32
-    sweeps: wp.int32
-    pivots: wp.int32
-    mutations: wp.int32
-    mutation_sigma: wp.float32  # [m]
-    per_pose: wp.int32
-    min_self_distance: wp.float32  # [m]
-    separation: wp.float32  # [rad]
+SearchValues = params_struct(
+    *("SearchValues", __name__, SearchParams),
+    floats="friction max_gswo max_unresisted_load min_self_distance torque_scale",
+    contacts=vec_kinds,
+    kinds=wp.int32,  # entries of ``contacts``
+    least=wp.int32,  # fewest finger contacts
+    min_contacts=wp.int32,  # of fingers' links and the palm
+    more=wp.int32,  # contacts beyond these, where a pose has them
+)
+"""SearchParams and GraspBounds as kernels read them; ``mutation_sigma`` is in [m]."""
 
 
 @wp.struct

@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from lgrasp.config import Params
-from lgrasp.stages.least_squares import Damping, Gap, JointStep
+from lgrasp.stages.least_squares import Damping, Gap, Indentation, JointStep
 
 
 class WrapParams(Params):
@@ -15,7 +15,5 @@ class WrapParams(Params):
     normal_weight: float = Field(default=0.15, ge=0, le=10, description="Weight of the contacts' normals.")
     damping: Damping = 1e-5
     step: JointStep = 0.3
-    contact_indentation: float = Field(
-        default=0.0003, ge=0, le=0.002, description="How far links aim to press in at a contact."
-    )
+    contact_indentation: Indentation = 0.0003
     gap: Gap = 0.0007

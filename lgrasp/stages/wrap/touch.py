@@ -5,10 +5,12 @@ import warp as wp
 from lgrasp.geometry.clusters import CLUSTER_SIZE
 from lgrasp.grasp.check_kernels import contact_fit
 from lgrasp.grasp.contact_kernels import PalmarRuns
-from lgrasp.hand.arrays import Hand, contact_allowed, hand_grid
-from lgrasp.math.sdf import Sdf, sdf_gradient
+from lgrasp.hand.arrays import Hand, contact_allowed
+from lgrasp.math.sdf import Sdf, sdf_gradient, sdf_of
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
+from lgrasp.runtime.structs import params_struct
+from lgrasp.stages.wrap.params import WrapParams
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -20,25 +22,10 @@ _GAP_WEIGHT = wp.constant(30.0)  # [1/m] beside the cosine of the normals: 0.1 m
 _WORTHLESS = wp.constant(-1.0e6)
 
 
-@wp.struct
-class WrapValues:
-    """WrapParams and GraspBounds as kernels read them."""
-
-    iterations: wp.int32
-    rounds: wp.int32
-    reach: wp.float32  # [m]
-    damping: wp.float32
-    normal_weight: wp.float32
-    step: wp.float32  # [rad or m]
-    contact_indentation: wp.float32  # [m]
-    gap: wp.float32  # [m]
-    cosine: wp.float32  # least, of the normals
-    max_gap: wp.float32  # [m]
-    min_cosine: wp.float32  # of the bounds
-    min_spread_cosine: wp.float32  # of the object's normals about a contact
-    allowed_penetration: wp.float32  # [m] of inner spheres
-    min_self_distance: wp.float32  # [m]
-    min_table_distance: wp.float32  # [m]
+_BOUNDS = "max_gap allowed_penetration min_self_distance min_table_distance"
+WrapValues = params_struct("WrapValues", __name__, WrapParams, floats=f"cosine min_cosine min_spread_cosine {_BOUNDS}")
+"""WrapParams and GraspBounds as kernels read them. Least cosines: of the normals, of these by the bounds, and of the
+object's normals about a contact."""
 
 
 @wp.struct
@@ -64,7 +51,7 @@ def nearest_touch(hand: Hand, obj: Object, runs: PalmarRuns, T: wp.transform, to
     for _s in range(slides):
         inside = at - wp.vec3(e[0], e[1], e[2]) * (e[3] + _DEPTH)
         local = wp.transform_point(wp.transform_inverse(T), inside)
-        s = sdf_gradient(hand_grid(hand.contacts, runs.grid[touch.run]), local)
+        s = sdf_gradient(sdf_of(hand.contacts.grids, runs.grid[touch.run]), local)
         out = wp.vec3(s[0], s[1], s[2])
         touch.local = local - out * s[3]
         # at an edge that of the facet before it
@@ -118,7 +105,7 @@ def contact_beside(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues
     """Contact point of the object that stands for a touch, -1 if none near by is a contact of the link's mesh."""
     best = int(-1)
     most = float(_WORTHLESS)
-    sdf = hand_grid(hand.contacts, runs.grid[touch.run])
+    sdf = sdf_of(hand.contacts.grids, runs.grid[touch.run])
     T_body = wp.transform_inverse(T)
     for run in range(obj.contact_sphere.shape[0]):
         ball = obj.contact_sphere[run]

@@ -17,7 +17,7 @@ from lgrasp.hand.build import build_hand
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
-from lgrasp.hand.opposition.spaces import Space, available, consumed, free_joints, hand_spaces, longest, spaces_view
+from lgrasp.hand.opposition.spaces import Space, available, hand_spaces, longest, spaces_view
 from lgrasp.hand.spec import HandSpec
 
 # index 0-3, middle 4-7, ring 8-11, thumb 12-15
@@ -73,7 +73,7 @@ def test_longest_is_that_of_a_brute_force(data):
     taken = np.array(data.draw(mask))
     found = longest(spaces, used, taken)
     assert found == brute_longest(spaces, used, taken)
-    assert consumed(spaces, used, taken) == (found == 0)
+    assert (not available(spaces, used, taken)) == (found == 0)
     if found:  # some space that may come next leads there
         following = available(spaces, used, taken)
         assert found == 1 + max(longest(spaces, used | {i}, taken | spaces[i].joints) for i in following)
@@ -90,7 +90,7 @@ def test_a_sequence_on_allegro_never_moves_a_joint_twice(picks):
         if not following:
             break
         i = following[pick % len(following)]
-        free = free_joints(spaces[i], joints)
+        free = spaces[i].joints & ~joints
         assert free.any()
         assert not (free & joints).any()
         assert not (free & ~spaces[i].joints).any()
@@ -106,16 +106,16 @@ def test_allegro_sequences():
     names = [s.name for s in spaces]
     assert longest(spaces, [], none) == 4
     i = names.index("thumb-index")
-    after = free_joints(spaces[i], none)
+    after = spaces[i].joints
     assert np.flatnonzero(after).tolist() == [0, 1, 2, 3, 12, 13, 14, 15]
     left = [names[k] for k in available(spaces, [i], after)]
     assert left == ["middle-palm", "ring-palm", "index-middle", "middle-ring"]
     assert longest(spaces, [i], after) == 2
     # index-middle then has the middle finger's joints only
     j = names.index("index-middle")
-    assert np.flatnonzero(free_joints(spaces[j], after)).tolist() == [4, 5, 6, 7]
-    assert consumed(spaces, [], np.ones(16, bool))
-    assert not consumed(spaces, [], none)
+    assert np.flatnonzero(spaces[j].joints & ~after).tolist() == [4, 5, 6, 7]
+    assert not available(spaces, [], np.ones(16, bool))
+    assert available(spaces, [], none)
 
 
 def test_a_used_space_does_not_come_back_though_its_joints_are_free():
