@@ -10,7 +10,7 @@ from lgrasp.errors import HandError
 from lgrasp.hand.links import joints_above
 from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.hand.tree import Tree, build_tree
-from lgrasp.hand.urdf import Urdf
+from lgrasp.hand.urdf import Joint, Urdf
 
 MAX_FINGERS = 6
 """Most parts of a hand that move by themselves."""
