@@ -84,8 +84,9 @@ def _run_one(request: "Request", how: How) -> dict[str, Any]:
 def _row(result: dict[str, Any]) -> tuple[str, ...]:
     numbers = ["-"] * 4
     if "asked" in result:
-        numbers[:2] = f"{result['asked']:,}", f"{result['made'] + result['present']:,}"
-        numbers[2:] = f"{result['seconds']['total']:.1f}", number(result.get("strict_valid_per_s"))
+        numbers[0] = f"{result['asked']:,}" if result["asked"] else "-"
+        numbers[1:3] = f"{result['made'] + result['present']:,}", f"{result['seconds']['total']:.1f}"
+        numbers[3] = number(result.get("strict_valid_per_s")) if result["made"] else "-"
     return (result["title"], result["unit"], *numbers, result["status"])
 
 
@@ -103,10 +104,11 @@ def run(
 ) -> None:
     """Run the job of a config, or one job for every hand, object and pipeline that it names.
 
-    Key 'job' names a command, and the other keys are its options; without it, grasps are generated. A job that fails
-    does not stop the others; the exit code is the worst one. Tasks of an array share the files of all jobs.
+    Key 'job' tells what to do; a key that it has not is refused with those that it has. Without it, grasps are
+    generated. A job that fails does not stop the others; the exit code is the worst one. Tasks of an array share the
+    files of all jobs.
 
-    Example: lgrasp run configs/smoke.yaml
+    Example: lgrasp run smoke
     """
     from lgrasp.jobs.config import load_requests
 

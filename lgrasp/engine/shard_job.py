@@ -11,6 +11,7 @@ from pydantic import PrivateAttr
 
 from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.gather import gather
+from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part
@@ -42,6 +43,8 @@ class ShardJob(ShardRequest, Job):
             self._objects.update(reader.object_ids)
             return len(reader), reader.header.shard_index
 
+        if not self.in_place:
+            tell_differences(self.shards)
         out, parts, places = self.folder, [], {}
         for number, (source, place, (rows, index)) in enumerate(gather(self.shards, look, leave_out=self.inside)):
             parts.append(Part(number, source if self.in_place else out / place, rows, source, index))

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from pydantic import Field, model_validator
 
+from lgrasp.choices import ProtocolName
 from lgrasp.config import (
     DeviceName,
     HandNames,
@@ -59,6 +60,7 @@ class JobConfig(Params):
     shard_rows: int = Field(10_000, ge=1)
     passes: int | None = Field(None, ge=1, le=64)
     negatives: Negatives = 0.0
+    simulate: ProtocolName | None = Field(None, description="Protocol that grasps must pass to be kept.")
     table: bool = Field(False, description="Grasps leave room for the table that the object rests on.")
     steer: Steering | None = Field(None, description="Requirements on the grasps, beyond those of the pipelines.")
     sequences: SequenceSets | None = Field(None, description="How the objects of sequences are drawn.")
@@ -76,6 +78,8 @@ class JobConfig(Params):
     def _has_objects(self) -> "JobConfig":
         if not self.objects and not self.object_dir and not self.sequences:
             raise ValueError("objects: name at least one")
+        if self.simulate and self.sequences:
+            raise ValueError("simulate: of sequences it is a key of 'sequences'")
         return self
 
 
@@ -157,7 +161,11 @@ def load_requests(name: str, changes: dict[str, Any]) -> ConfigJobs:
     if kind == "generate" or "sequences" in data:
         return ConfigJobs(plan_requests(parse_model(JobConfig, data, f"config {path}")), devices)
     data.pop("description", None)
-    return ConfigJobs([parse_model(named(KINDS[kind]), data, f"config {path}")], devices)
+    model = named(KINDS[kind])
+    if unfit := changes.keys() - model.model_fields.keys():
+        option = f"--{min(unfit).replace('_', '-')}"
+        raise ConfigError(f"config {path}: job '{kind}' has no {option}; its keys: {', '.join(model.model_fields)}")
+    return ConfigJobs([parse_model(model, data, f"config {path}")], devices)
 
 
 def plan_requests(config: JobConfig) -> list[Request]:
@@ -179,8 +187,9 @@ def plan_requests(config: JobConfig) -> list[Request]:
             meshes = [in_folder(config.object_dir, mesh) for mesh in objects]
             own = pipeline.with_params("search", passes=config.passes) if config.passes else pipeline
             own = own.with_table() if config.table else own
+            own = own.with_simulation(config.simulate) if config.simulate else own
             more = config.model_dump(include={"scale", "batch", "negatives"})
-            found += pair_requests(hands, meshes, own, config.out, **shared, **more)
+            found += pair_requests(hands, meshes, own, config.out, config.simulate, **shared, **more)
             continue
         what = shared | sets.model_dump(include={"scale", "simulate", "method", "policy"})
         what |= {"shard_rows": min(config.shard_rows, 1000), "pipeline": pipeline}
@@ -246,8 +255,11 @@ def _names(hand: str, mesh: str, called: Callable[[str], str]) -> tuple[str, str
 
 def _pipelines(config: JobConfig) -> Iterator[Pipeline]:
     """Each pipeline with the config's seed."""
-    for name in config.pipelines:
+    called: dict[str, str] = {}
+    for name in dict.fromkeys(config.pipelines):
         pipeline = load_pipeline(name).with_settings(config.settings)
+        if (other := called.setdefault(pipeline.name, name)) != name:
+            raise ConfigError(f"pipelines {other} and {name} have one name, '{pipeline.name}', so one folder")
         if config.steer:
             pipeline = pipeline.with_steering(**config.steer.model_dump(exclude_unset=True))
         yield pipeline.with_seed(config.seed)
@@ -268,7 +280,10 @@ def _objects(config: JobConfig) -> tuple[str, ...]:
     own = {mesh for mesh in found if Path(mesh).stem in named}
     others = named.keys() - {Path(mesh).stem for mesh in own}
     contents = {_contents(config, mesh) for mesh in (*own, *(named[name] for name in others))}
-    return tuple(mesh for mesh in found if mesh not in own and _contents(config, mesh) not in contents)
+    left = tuple(mesh for mesh in found if mesh not in own and _contents(config, mesh) not in contents)
+    if not left:
+        raise ConfigError(f"held_out: none of the {len(found)} objects is left")
+    return left
 
 
 def _contents(config: JobConfig, mesh: str) -> str:

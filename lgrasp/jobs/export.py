@@ -12,6 +12,7 @@ from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.formats import FORMATS, export_shards
 from lgrasp.dataset.exports.selection import chosen_rows, number_columns
 from lgrasp.dataset.gather import gather
+from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.split import Split
 from lgrasp.engine.cache import content_key
@@ -49,6 +50,7 @@ class ExportJob(ExportRequest, Job):
         return content_key("export", 3, to=self.to, rows=rows, split=parts, **options)
 
     def parts(self) -> list[Part]:
+        tell_differences(self.shards)
         return [Part(0, self.out / _INDEX)]
 
     def present(self, parts: Sequence[Part]) -> dict[int, int]:

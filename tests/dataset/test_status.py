@@ -125,6 +125,13 @@ def test_dataset_says_what_is_missing(tmp_path, said):
     assert "1 of the shards there are not listed, first other.h5" in foreign
 
 
+def test_copies_say_what_is_missing(tmp_path, said):
+    run(SampleJob(out=tmp_path / "all"))
+    (tmp_path / "all" / "toy-cup-00002.h5").unlink()
+    assert call("export", tmp_path / "all", "--to", "webdataset", "--out", tmp_path / "web").exit_code == 0
+    assert ["1 of 3 shards are missing" in line for line in said] == [True]
+
+
 def test_status_loads_nothing_slow():
     code = "import sys, lgrasp_cli.status, lgrasp.dataset.status\n"
     code += "print([m for m in ('torch', 'warp', 'scipy', 'trimesh', 'mujoco') if m in sys.modules])"

@@ -203,12 +203,21 @@ def test_run_on_several_devices(cli, tmp_path, monkeypatch):
         ("job: sequence\nobjects: [tiny, tiny]\nseed: x", "c.yaml: key 'seed' = 'x': give a whole number"),
         ("objects: [tiny]\npipelines: [swfit]", "did you mean 'swift'"),
         ("objects: [tiny]\nobject_dir: nowhere", "nowhere"),
+        ("objects: [tiny]\nheld_out: [tiny]", "held_out: none of the 1 objects is left"),
+        ("objects: [tiny]\npipelines: [swift, ./swift.yaml]", "pipelines swift and ./swift.yaml have one name"),
+        ("objects: [tiny]\nsequences: {sets: 1}\nsimulate: fc", "simulate: of sequences"),
         ("objects: [tiny]\ndevice: cpu,gpu", "key 'device' = 'cpu,gpu': device 'gpu' cannot be"),
     ],
 )
 def test_wrong_configs(cli, tmp_path, text, words):
     (tmp_path / "c.yaml").write_text(text)
+    Path("swift.yaml").write_text("name: swift\nstages: [place: {}, domain: {}, ik: {}, search: {}, filter: {}]\n")
     assert words in cli("run", tmp_path / "c.yaml").error()
+
+
+def test_options_that_a_job_of_a_config_lacks(cli, tmp_path):
+    (tmp_path / "c.yaml").write_text("job: plan\nobject: tiny")
+    assert "job 'plan' has no --rows; its keys: " in cli("run", tmp_path / "c.yaml", "-n", 5).error()
 
 
 def test_jobs_have_the_names_and_defaults_of_their_commands(tmp_path):
