@@ -117,7 +117,7 @@ def test_rounds_of_contacts_need_ik_before_search(swift, lightning):
 def other(value: Any, kind: Any) -> list[Any]:
     """Values to try in place of a parameter's; at least one of them is within its bounds."""
     if value is None:
-        return [SHIPPED]  # a policy
+        return [SHIPPED, 1]  # a policy, and how many poses it rates
     if isinstance(value, str):
         return [c for c in get_args(kind) if c != value]
     if isinstance(value, bool):
