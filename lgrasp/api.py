@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from numbers import Real
 from os import PathLike, fspath
 from pathlib import Path
@@ -115,13 +115,7 @@ class Grasps(GraspRows):
         if self.sequence is not None:
             raise ConfigError("rows of sequences extend other rows of their file; take what you need from the columns")
         at = rows if isinstance(rows, slice) else np.asarray(rows, None if np.size(rows) else int)  # [] would be float
-        chosen = np.arange(len(self))[at].reshape(-1)
-        changed: dict[str, Any] = {}
-        for name, values in self.columns().items():
-            group, slash, member = name.partition("/")
-            place = changed.setdefault(group, {}) if slash else changed
-            place[member if slash else name] = values[chosen]
-        return replace(self, **changed)
+        return self.select(np.arange(len(self))[at].reshape(-1))
 
 
 def _rows(of: GraspRows) -> dict[str, Any]:

@@ -298,7 +298,10 @@ def bench_soak(
     for result in run_soak(*chosen, rounds=rounds, hours=hours, seed=seed, **({} if quiet else {"say": say})):
         if file:
             write_json(file, result)
-    _print(result, json_path, soak_page(result))
+    if quiet:
+        print_report(result, json_path, ())
+    else:
+        _print(result, json_path, soak_page(result))
     if result["faults"]:
         raise typer.Exit(1)
 

@@ -180,7 +180,7 @@ def check_hand(
         *_show_spaces(found),
         *(f"wrote {picture}" for picture in found.pictures),
     ]
-    return Answer(asdict(found) | {"pictures": [str(p) for p in found.pictures]}, blocks)
+    return Answer(asdict(found) | {"pictures": [str(p) for p in found.pictures]}, [] if quiet else blocks)
 
 
 @app.command("compare")

@@ -2,9 +2,9 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -164,6 +164,15 @@ class GraspRows:
         flat |= {f"table/{name}": values for name, values in self.table.items()}
         flat |= {f"metrics/{name}": values for name, values in self.metrics.items()}
         return flat | {f"physics/{name}": values for name, values in self.physics.items()}
+
+    def select(self, rows: np.ndarray) -> Self:
+        """Some rows of single objects, by number or mask; those of sequences extend other rows of their file."""
+        changed: dict[str, Any] = {}
+        for name, values in self.columns().items():
+            group, slash, member = name.partition("/")
+            place = changed.setdefault(group, {}) if slash else changed
+            place[member if slash else name] = np.asarray(values)[rows]
+        return replace(self, **changed)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,7 +69,7 @@ def test_check_measures_the_spaces(cli, jaws, quick, tmp_path):
     thin = [part | {"box": {"min": [5, 5, 5], "max": [6, 6, 6]}} for part in rules[PINCH]["sides"]]
     change(jaws, rules | {"away": rules[PINCH] | {"sides": away}, "nothing": rules[PINCH] | {"sides": thin}})
     folder = tmp_path / "pictures"
-    shown = cli("hands", "check", jaws, "-n", 1, "-p", quick, "--device", "cpu", "--out", folder, "--quiet")
+    shown = cli("hands", "check", jaws, "-n", 1, "-p", quick, "--device", "cpu", "--out", folder)
     assert shown.code == 0, shown
     lines = shown.out.splitlines()
     table = next(i for i, line in enumerate(lines) if line.startswith("space "))

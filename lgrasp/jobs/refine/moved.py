@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome, failed_bounds
 from lgrasp.grasp.records import GraspRows, padded
 from lgrasp.grasp.rows import POSTURES, grasp_rows, press
-from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.grasp.tables import CONTACTS, GraspTable, choose_grasps, join_rows, widen_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.math.limits import MAX_CONTACTS
@@ -98,7 +97,7 @@ def move_rows(
     if stored:
         made = _kept(rows, made, taken | outside | ~known, measured)
     if not keep_invalid:
-        made = _some(made, valid)
+        made = made.select(valid)
     means = float(first_energy.sum(0).mean()), float(last_energy.sum(0).mean())
     far, lost = sum(p.far for p in parts), int((~valid).sum())
     return Moved(made, means, (int(was.sum()), int(valid.sum())), lost, int(outside.sum()), far)
@@ -167,14 +166,6 @@ def _rounded(bounds: GraspBounds) -> GraspBounds:
             "max_unresisted_load": bounds.max_unresisted_load + 1000 * _POSE_ROUNDING,
         }
     )
-
-
-def _some(rows: GraspRows, chosen: np.ndarray) -> GraspRows:
-    """The rows that are chosen, (N,) bool."""
-    fields: dict[str, Any] = {name: np.asarray(getattr(rows, name))[chosen] for name in GRASP_FIELDS}
-    for family in ("metrics", "table"):
-        fields[family] = {name: np.asarray(x)[chosen] for name, x in getattr(rows, family).items()}
-    return replace(rows, **fields)
 
 
 def _ways(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

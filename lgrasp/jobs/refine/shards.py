@@ -241,8 +241,7 @@ def _grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) ->
             vertices=mesh.vertices.astype(np.float32),
             faces=mesh.faces,
         )
-        own = replace(rows, **{name: np.asarray(values)[chosen] for name, values in rows.columns().items()})
-        own = replace(own, object_index=np.zeros((len(chosen), 1), np.int32))
+        own = replace(rows.select(chosen), object_index=np.zeros((len(chosen), 1), np.int32))
         header = ShardHeader(
             pipeline=form, seed=0, shard_index=0, config={"read_from": str(path), **hand_config(source)}
         )
