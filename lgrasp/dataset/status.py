@@ -89,7 +89,8 @@ def _state(folder: Path, run: ListedRun, found: Differences, working: Any) -> di
     else:
         starved = any(shard.asked is not None and (shard.rows or 0) < shard.asked for shard in there)
         state = "starved" if starved else "complete"
-    asked = [shard.asked for shard in run.shards if shard.asked is not None]
+    # fewer may have been asked for since
+    asked = [max(shard.asked, shard.rows or 0) for shard in run.shards if shard.asked is not None]
     return {
         "folder": str(folder),
         **run.model_dump(exclude={"shards"}),
