@@ -42,17 +42,21 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
         ConfigError: see :func:`~lgrasp.steer.typed.typed`, :func:`~lgrasp.steer.typed.asked_sides` and
             :func:`~lgrasp.steer.typed.asked_thumb`; a policy that is none, or of another hand.
     """
+    policy, steer, search = pipeline.params("place").policy, pipeline.steer, pipeline.params("search")
+    steered = steer.grasp_type is not None or steer.thumb is not None or any(steer.sides.values())
+    contacts = max(pipeline.bounds.min_contacts, 0 if search.usual_contacts else min(search.contacts))
+    if not (pipeline.open_to_hands or policy or steered or contacts > FEWEST_CONTACTS):
+        return pipeline  # of any hand: it need not be read
     source = hand_source(hand)
     urdf = read_urdf(source.urdf)
     tree = build_tree(urdf, source.spec)
     pipeline = pipeline.suited(float(tree.dof_free.mean()))
-    policy, steer = pipeline.params("place").policy, pipeline.steer
     if policy == SHIPPED:
         shipped = own_policy(pipeline, source)
         pipeline = pipeline.with_params("place", policy=str(shipped) if shipped else None)
     elif policy is not None:
         read_policy(policy).check_hand(source.name, tree.joint_names, policy)
-    if steer.grasp_type is not None or steer.thumb is not None or any(steer.sides.values()):
+    if steered:
         anatomy = Anatomy(source.spec, urdf, tree)
         steer = typed(steer, anatomy)
         asked = {"sides": asked_sides(steer, anatomy), "thumb": asked_thumb(steer, anatomy)}
