@@ -82,9 +82,9 @@ class Bank:
             return None
         try:
             about = json.loads(str(arrays.pop(_NUMBERS_MEMBER)))
-            kept, interrupted = about.pop("kept"), about.pop("interrupted")
             about["spans"] = [(begin, end) for begin, end in about["spans"]]
-            account = Account(ShardResult(table_of(GraspTable, arrays), **about), kept, interrupted)
+            found = ShardResult(table_of(GraspTable, arrays), **{name: about[name] for name in _BANKED})
+            account = Account(found, about["kept"], about["interrupted"])
         except (KeyError, ValueError, TypeError):
             self.cache.warn(f"bank {self.cache.path('bank', self.key)} is damaged; rebuilding it")
             return None
