@@ -66,8 +66,7 @@ def source_yields(pipeline: Pipeline, context: Context, candidates: int) -> dict
 
 def source_weights(pipeline: Pipeline) -> dict[str, float]:
     """Weights of the sources of stage place that have one."""
-    weights = {name: getattr(pipeline.params("place"), name) for name in SOURCES}
-    return {name: weight for name, weight in weights.items() if weight > 0}
+    return {name: weight for name, weight in pipeline.params("place").weights.items() if weight > 0}
 
 
 def _batches(context: Context, candidates: int) -> list[tuple[int, int]]:

@@ -76,3 +76,8 @@ class PlaceParams(Params):
     @field_serializer("policy", when_used="json")
     def _by_content(self, value: str | None) -> str | None:
         return value if value in (None, SHIPPED) else policy_digest(value)
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Weight of each source, by name."""
+        return {name: getattr(self, name) for name in SOURCES}

@@ -17,7 +17,7 @@ from lgrasp.runtime.tally import Tally, empty_tally
 from lgrasp.stages.context import Context
 from lgrasp.stages.place.kernels import choose_poses, propose_poses, take_poses
 from lgrasp.stages.place.opposed_kernels import propose_opposed
-from lgrasp.stages.place.params import SOURCES, PlaceParams
+from lgrasp.stages.place.params import PlaceParams
 from lgrasp.stages.place.predicted_kernels import propose_predicted
 from lgrasp.stages.place.rating import rated_chance
 from lgrasp.stages.place.structs import PlaceCount, PlaceValues, ProposedPoses
@@ -78,7 +78,7 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
 def _shares(params: PlaceParams, learnt: Mapping[str, float], field: FieldArrays, *, palm: bool) -> dict[str, float]:
     """Share of each source in the proposals, by weight and by what it was ``learnt`` to be worth; where the palm must
     touch, of those that put the object on it."""
-    weights = {name: getattr(params, name) for name in SOURCES}
+    weights = params.weights
     if palm:
         on_palm = bool((field.model.pair_slot < 0).any(1).all())  # pairs of a lone finger and the palm
         weights |= {"canonical": 0.0, "exhaustive": 0.0, "palm": params.palm or 1.0}
