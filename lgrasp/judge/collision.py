@@ -3,14 +3,13 @@
 import itertools
 from collections.abc import Callable, Sequence
 
-import coal
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
 from lgrasp.judge.hand import LinkTree, parse, read_joint, read_solids
 from lgrasp.judge.meshes import MeshDistance, mass_centre, surface_samples
-from lgrasp.judge.solids import JudgedSolid
+from lgrasp.judge.solids import JudgedSolid, coal
 
 POSTURES = 200
 """Random postures in all of which a pair of links touches before it is left out."""

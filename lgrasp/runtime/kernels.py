@@ -16,9 +16,9 @@ from lgrasp.runtime.kernel_cache import has_compiled, note_checksums
 
 
 def import_all() -> None:
-    """Import every module of lgrasp, so that :func:`kernel_modules` sees them."""
+    """Import every module of lgrasp, so that :func:`kernel_modules` sees them; the judge needs a package of its own."""
     for found in pkgutil.walk_packages(lgrasp.__path__, "lgrasp."):
-        if not found.name.startswith("lgrasp._data"):
+        if not found.name.startswith(("lgrasp._data", "lgrasp.judge")):
             importlib.import_module(found.name)
 
 

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.run import judge
+from lgrasp.runtime.kernels import import_all
 from lgrasp_cli.main import app
 
 ALONE = """
@@ -54,6 +55,19 @@ def test_table_json_and_exit_code(tmp_path):
     refused = run(tmp_path / "good.h5", "--json", tmp_path)
     assert (refused.exit_code, refused.stdout) == (2, "")
     assert refused.stderr == f"error: file {tmp_path} cannot be written: it is a folder; name a file\n"
+
+
+def test_without_coal_only_the_judge_is_missing(tmp_path, monkeypatch):
+    write_shard(tmp_path / "good.h5", [row()])
+    for name in [name for name in sys.modules if name.startswith("lgrasp.judge.") and not name.endswith(".bounds")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr(sys.modules["lgrasp.judge"], "run")
+    monkeypatch.setitem(sys.modules, "coal", None)
+    import_all()
+    refused = run(tmp_path)
+    assert (refused.exit_code, refused.stdout) == (2, "")
+    installs = "the judge measures collisions between links with coal: pip install 'lgrasp[judge]'"
+    assert refused.stderr == f"error: {installs}\n"
 
 
 def test_rows_that_the_file_calls_invalid_count_apart(tmp_path):
