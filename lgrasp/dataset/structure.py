@@ -74,6 +74,7 @@ def _walk(file: h5py.File) -> tuple[dict[str, Any], str]:
     names that could not be those of files.
     """
     nodes: dict[str, Any] = {"": file}
+    readonly = file.mode == "r"
     todo: list[tuple[str, h5py.Group, int]] = [("", file, 1)]
     while todo:
         path, group, depth = todo.pop()
@@ -83,7 +84,7 @@ def _walk(file: h5py.File) -> tuple[dict[str, Any], str]:
                 return nodes, f"{here!r}: the name cannot be used: {name_problem(name)}"
             if link != h5py.h5l.TYPE_HARD:
                 return nodes, f"{here}: is a link; the file must hold its own data"
-            nodes[here] = node = _member(group, name)
+            nodes[here] = node = _member(group, name, readonly)
             if isinstance(node, h5py.Group):
                 if depth == _MOST_GROUPS:
                     return nodes, f"{here}: more than {_MOST_GROUPS} groups inside each other"
@@ -100,11 +101,12 @@ def _links(group: h5py.Group) -> list[tuple[str, int]]:
     return found
 
 
-def _member(group: h5py.Group, name: str) -> Any:
+def _member(group: h5py.Group, name: str, readonly: bool) -> Any:
     """As ``group[name]``, in 0.6 of the time."""
     found = h5py.h5o.open(group.id, name.encode())
-    kind = {h5py.h5g.GroupID: h5py.Group, h5py.h5d.DatasetID: h5py.Dataset}.get(type(found))
-    return kind(found) if kind else group[name]
+    if isinstance(found, h5py.h5d.DatasetID):
+        return h5py.Dataset(found, readonly=readonly)
+    return h5py.Group(found) if isinstance(found, h5py.h5g.GroupID) else group[name]
 
 
 def _foreign_data(dataset: h5py.Dataset) -> str:
