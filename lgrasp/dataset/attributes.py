@@ -22,7 +22,7 @@ def read_attribute(node: Any, name: str) -> Any:
     kind = type(stored := found.get_type())
     if found.shape == ():
         if kind is h5py.h5t.TypeStringID and stored.is_variable_str() and (charset := stored.get_cset()) in _TEXTS:
-            text = np.zeros((), _TEXTS[charset])
+            text: Any = np.zeros((), _TEXTS[charset])
             found.read(text, mtype=_MEMORY[charset])
             return text[()].decode("utf-8", "surrogateescape")
         if kind in (h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID):

@@ -97,7 +97,11 @@ def _walk(file: h5py.File) -> tuple[dict[str, Any], str]:
 def _links(group: h5py.Group) -> list[tuple[str, int]]:
     """Names of a group's members, and the kinds of their links."""
     found: list[tuple[str, int]] = []
-    group.id.links.iterate(lambda name, info: found.append((name.decode(errors="surrogateescape"), info.type)), info=True)
+
+    def note(name: bytes, info: Any) -> None:
+        found.append((name.decode("utf-8", "surrogateescape"), info.type))
+
+    group.id.links.iterate(note, info=True)
     return found
 
 
