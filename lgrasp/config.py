@@ -1,6 +1,8 @@
 """YAML declarations -> checked pydantic models; unknown keys fail and name the nearest valid one."""
 
+import copy
 import difflib
+import functools
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,6 +27,7 @@ from lgrasp.paths import data_dirs
 
 Model = TypeVar("Model", bound=BaseModel)
 
+_YAML_KEPT = 100_000  # letters, at most, of a text whose values are kept
 _YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _YAML_DEPTH, _YAML_BYTES = 64, 4 << 20
 
@@ -151,6 +154,12 @@ def load_yaml(text: str | bytes) -> Any:
     Raises:
         yaml.YAMLError: no such text.
     """
+    return copy.deepcopy(_parsed(text)) if len(text) < _YAML_KEPT else _parsed.__wrapped__(text)
+
+
+@functools.lru_cache(maxsize=32)
+def _parsed(text: str | bytes) -> Any:
+    """See :func:`load_yaml`; a process reads the files of hands and grasp types again and again."""
     sizes: dict[str, int] = {}  # values behind each anchor
     inside: list[tuple[str | None, int]] = []  # (anchor, values before) of the collections around
     values = 0

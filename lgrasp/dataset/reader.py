@@ -11,6 +11,7 @@ from typing import Any, Self
 import h5py
 import numpy as np
 
+from lgrasp.dataset.attributes import read_attribute, read_attributes
 from lgrasp.dataset.files import check_heaps, check_regular
 from lgrasp.dataset.structure import expand, format_problems, shard_problems
 from lgrasp.errors import ShardError, short_reason
@@ -54,14 +55,16 @@ class FileReader:
             structure; on reading, a checksum does not match.
     """
 
-    def __init__(self, path: str | os.PathLike[str], problems: Callable[[h5py.File], list[str]]) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], problems: Callable[[h5py.File], tuple[dict[str, Any], list[str]]]
+    ) -> None:
         self.path = Path(path)
         self._file = open_hdf5(self.path)
         try:
             with reading(self.path):
-                problem = next(iter(problems(self._file)), None)
-            if problem:
-                raise ShardError(f"{self.path}: {problem}")
+                self._nodes, found = problems(self._file)
+            if found:
+                raise ShardError(f"{self.path}: {found[0]}")
         except BaseException:
             self.close()
             raise
@@ -80,28 +83,28 @@ class FileReader:
     def attributes(self) -> dict[str, Any]:
         """The root attributes as stored (``config`` is JSON text)."""
         with reading(self.path):
-            return dict(self._file.attrs)
+            return read_attributes(self._file)
 
     @property
     def object_ids(self) -> list[str]:
         """Sorted object ids; ``object_index`` counts in this list."""
-        return sorted(self._file["objects"])
+        return [path.removeprefix("objects/") for path in expand(self._nodes, "objects/*")]
 
     def hand(self) -> HandRecord:
         """The hand, with its mesh files."""
         with reading(self.path):
-            group, attrs = self._file["hand"], self._file.attrs
-            blobs = [group["meshes"][name] for name in sorted(group.get("meshes", ()), key=lambda n: (len(n), n))]
+            nodes, attrs = self._nodes, self.attributes
+            blobs = [nodes[path] for path in sorted(expand(nodes, "hand/meshes/*"), key=lambda n: (len(n), n))]
             return HandRecord(
                 name=attrs["hand"],
-                base_link=group.attrs["base_link"],
-                urdf=group["urdf"].asstr()[()],
-                joint_names=tuple(group["joint_names"].asstr()[()]),
-                joint_lower=group["joint_lower"][()],
-                joint_upper=group["joint_upper"][()],
-                link_names=tuple(group["link_names"].asstr()[()]),
+                base_link=read_attribute(nodes["hand"], "base_link"),
+                urdf=nodes["hand/urdf"].asstr()[()],
+                joint_names=tuple(nodes["hand/joint_names"].asstr()[()]),
+                joint_lower=nodes["hand/joint_lower"][()],
+                joint_upper=nodes["hand/joint_upper"][()],
+                link_names=tuple(nodes["hand/link_names"].asstr()[()]),
                 sha256=attrs["hand_sha256"],
-                meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
+                meshes={read_attribute(blob, "path"): blob[()].tobytes() for blob in blobs},
             )
 
     def object(self, object_id: str) -> ObjectRecord:
@@ -109,17 +112,19 @@ class FileReader:
         with reading(self.path):
             if object_id not in self.object_ids:
                 raise ShardError(f"{self.path}: no object {object_id!r}; it has {', '.join(self.object_ids)}")
-            group = self._file["objects"][object_id]
+            here = f"objects/{object_id}"
+            nodes, attrs = self._nodes, read_attributes(self._nodes[here])
+            parts = {name: nodes.get(f"{here}/{name}") for name in ("normals", "tables", "regions")}
             return ObjectRecord(
                 id=object_id,
-                name=group.attrs["name"],
-                scale=float(group.attrs["scale"]),
-                sha256=group.attrs["sha256"],
-                watertight=bool(group.attrs["watertight"]),
-                vertices=group["vertices"][()],
-                faces=group["faces"][()],
-                **{name: group[name][()] for name in ("normals", "tables", "regions") if name in group},
-                touch_share=float(group.attrs.get("touch_share", 1.0)),
+                name=attrs["name"],
+                scale=float(attrs["scale"]),
+                sha256=attrs["sha256"],
+                watertight=bool(attrs["watertight"]),
+                vertices=nodes[f"{here}/vertices"][()],
+                faces=nodes[f"{here}/faces"][()],
+                **{name: part[()] for name, part in parts.items() if part is not None},
+                touch_share=float(attrs.get("touch_share", 1.0)),
             )
 
     def objects(self) -> tuple[ObjectRecord, ...]:
@@ -130,7 +135,7 @@ class FileReader:
     def statistics(self) -> dict[str, int | float | str]:
         """Counts and seconds, device name."""
         with reading(self.path):
-            attrs = self._file["statistics"].attrs
+            attrs = read_attributes(self._nodes["statistics"])
             return {k: v.item() if isinstance(v, np.generic) else v for k, v in sorted(attrs.items())}
 
 
@@ -166,15 +171,15 @@ class ShardReader(FileReader):
     def space_names(self) -> tuple[str, ...] | None:
         """Opposition spaces of the hand that ``sequence/space`` counts in; None if the rows are no sequences."""
         with reading(self.path):
-            found = self._file.get("sequence/space_names")
+            found = self._nodes.get("sequence/space_names")
             return None if found is None else tuple(found.asstr()[()])
 
     @cached_property
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
         """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...)."""
         names = [*GRASP_FIELDS, *(SEQUENCE_FIELDS if self.space_names is not None else ())]
-        names += TABLE_FIELDS if "table" in self._file["grasps"] else ()
-        for path in (path for group in ("metrics", "physics") for path in expand(self._file, f"grasps/{group}/*")):
+        names += TABLE_FIELDS if "grasps/table" in self._nodes else ()
+        for path in (path for group in ("metrics", "physics") for path in expand(self._nodes, f"grasps/{group}/*")):
             name = path.removeprefix("grasps/")
             names.append(_RENAMED.get(name, name))
         found = {name: self._dataset(name) for name in names}
@@ -184,7 +189,7 @@ class ShardReader(FileReader):
     def object_keys(self) -> list[tuple[str, str, float]]:
         """Id, hash and scale of every object, sorted by id."""
         with reading(self.path):
-            objects = [(name, self._file["objects"][name].attrs) for name in self.object_ids]
+            objects = [(name, self._nodes[f"objects/{name}"].attrs) for name in self.object_ids]
             return [(name, attrs["sha256"], float(attrs["scale"])) for name, attrs in objects]
 
     def column(self, name: str, start: int = 0, stop: int | None = None) -> np.ndarray:
@@ -218,7 +223,7 @@ class ShardReader(FileReader):
         ):
             members = {n.partition("/")[2]: v for n, v in values.items() if n.startswith(f"{group}/")}
             fields[group] = members
-            fields[texts] = {n: self._dataset(f"{group}/{n}").attrs[attribute] for n in members}
+            fields[texts] = {n: read_attribute(self._dataset(f"{group}/{n}"), attribute) for n in members}
         fields["table"] = {n.partition("/")[2]: v for n, v in values.items() if n in TABLE_FIELDS}
         if self.space_names is not None:
             steps = {name.removeprefix("sequence/"): values[name] for name in SEQUENCE_FIELDS}
@@ -249,7 +254,7 @@ class ShardReader(FileReader):
         with reading(self.path):
             path = GRASP_FIELDS[name].path if name in GRASP_FIELDS else f"grasps/{name}"
             old = next((f"grasps/{was}" for was, now in _RENAMED.items() if now == name), None)
-            return self._file[old if old and old in self._file and path not in self._file else path]
+            return self._nodes[old if old and old in self._nodes and path not in self._nodes else path]
 
 
 def count_rows(path: str | os.PathLike[str]) -> int:

@@ -4,13 +4,14 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
 import h5py
 import numpy as np
 
+from lgrasp.dataset.attributes import has_attribute, read_attribute, read_attributes
 from lgrasp.grasp.schema import (
     ATTRIBUTES,
     DATASETS,
@@ -43,19 +44,21 @@ def format_problems(file: h5py.File, name: str, form: str, version: str) -> list
     return []
 
 
-def shard_problems(file: h5py.File) -> list[str]:
-    """Why a file is no whole shard, or all differences to the schema, one line each; empty when it conforms."""
+def shard_problems(file: h5py.File) -> tuple[dict[str, Any], list[str]]:
+    """The :func:`members` of a file, and why it is no whole shard, or all differences to the schema, one line each;
+    empty when it conforms."""
     return whole_problems(file, "grasp shard", FORMAT, FORMAT_VERSION, structure_problems)
 
 
 def whole_problems(
     file: h5py.File, name: str, form: str, version: str, structure: Callable[[dict[str, Any]], list[str]]
-) -> list[str]:
-    """Why a file is no whole file of a format, one line each; ``structure`` tells what its :func:`members` lack."""
+) -> tuple[dict[str, Any], list[str]]:
+    """The :func:`members` of a file, and why it is no whole file of a format, one line each; ``structure`` tells what
+    its members lack."""
     if problems := format_problems(file, name, form, version):
-        return problems
+        return {}, problems
     nodes, problem = _walk(file)
-    return [problem] if problem else structure(nodes)
+    return nodes, [problem] if problem else structure(nodes)
 
 
 def members(file: h5py.File) -> dict[str, Any]:
@@ -71,16 +74,17 @@ def _walk(file: h5py.File) -> tuple[dict[str, Any], str]:
     names that could not be those of files.
     """
     nodes: dict[str, Any] = {"": file}
+    readonly = file.mode == "r"
     todo: list[tuple[str, h5py.Group, int]] = [("", file, 1)]
     while todo:
         path, group, depth = todo.pop()
-        for name in group:
+        for name, link in _links(group):
             here = f"{path}{name}"
             if name_problem(name):
                 return nodes, f"{here!r}: the name cannot be used: {name_problem(name)}"
-            if group.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
+            if link != h5py.h5l.TYPE_HARD:
                 return nodes, f"{here}: is a link; the file must hold its own data"
-            nodes[here] = node = _member(group, name)
+            nodes[here] = node = _member(group, name, readonly)
             if isinstance(node, h5py.Group):
                 if depth == _MOST_GROUPS:
                     return nodes, f"{here}: more than {_MOST_GROUPS} groups inside each other"
@@ -90,11 +94,23 @@ def _walk(file: h5py.File) -> tuple[dict[str, Any], str]:
     return nodes, ""
 
 
-def _member(group: h5py.Group, name: str) -> Any:
+def _links(group: h5py.Group) -> list[tuple[str, int]]:
+    """Names of a group's members, and the kinds of their links."""
+    found: list[tuple[str, int]] = []
+
+    def note(name: bytes, info: Any) -> None:
+        found.append((name.decode("utf-8", "surrogateescape"), info.type))
+
+    group.id.links.iterate(note, info=True)
+    return found
+
+
+def _member(group: h5py.Group, name: str, readonly: bool) -> Any:
     """As ``group[name]``, in 0.6 of the time."""
     found = h5py.h5o.open(group.id, name.encode())
-    kind = {h5py.h5g.GroupID: h5py.Group, h5py.h5d.DatasetID: h5py.Dataset}.get(type(found))
-    return kind(found) if kind else group[name]
+    if isinstance(found, h5py.h5d.DatasetID):
+        return h5py.Dataset(found, readonly=readonly)
+    return h5py.Group(found) if isinstance(found, h5py.h5g.GroupID) else group[name]
 
 
 def _foreign_data(dataset: h5py.Dataset) -> str:
@@ -140,21 +156,21 @@ def schema_problems(
     for attribute in attributes:
         for path in expand(nodes, attribute.path):
             if (owner := nodes.get(path)) is not None:
-                problems += _attribute_problems(owner.attrs, path, attribute)
+                problems += _attribute_problems(owner, path, attribute)
     return problems
 
 
-def expand(nodes: h5py.File | Mapping[str, Any], pattern: str) -> list[str]:
+def expand(nodes: Iterable[str], pattern: str) -> list[str]:
     """The concrete paths of a schema path: ``*`` becomes each member of the group it is in, sorted.
 
     Args:
-        nodes: a file, or its :func:`members`.
+        nodes: paths of a file's :func:`members`.
     """
     head, star, tail = pattern.partition("*")
     if not star:
         return [pattern]
-    group = nodes.get(head.rstrip("/"))
-    return [f"{head}{name}{tail}" for name in sorted(group)] if isinstance(group, h5py.Group) else []
+    inside = (path.removeprefix(head) for path in nodes if path.startswith(head))
+    return [f"{head}{name}{tail}" for name in sorted(inside) if "/" not in name]
 
 
 def _dataset_problems(dataset: Any, path: str, spec: DatasetSpec, dims: dict[str, int]) -> list[str]:
@@ -187,11 +203,11 @@ def _dtype_matches(actual: np.dtype, expected: str) -> bool:
     return actual.kind == want.kind and actual.itemsize == want.itemsize
 
 
-def _attribute_problems(attrs: Any, path: str, spec: AttributeSpec) -> list[str]:
+def _attribute_problems(owner: Any, path: str, spec: AttributeSpec) -> list[str]:
     where = f"{path or '/'}: attribute {spec.name}"
-    if spec.name not in attrs:
+    if not has_attribute(owner, spec.name):
         return [f"{where} is missing"] if spec.required else []
-    value, (what, reads) = attrs[spec.name], _KINDS[spec.kind]
+    value, (what, reads) = read_attribute(owner, spec.name), _KINDS[spec.kind]
     if isinstance(reads, str):
         good = np.ndim(value) == 0 and np.asarray(value).dtype.kind in reads
     else:
@@ -225,7 +241,7 @@ def text_sha256(nodes: Mapping[str, Any]) -> str:
     """
     texts: dict[str, Any] = {}
     for path, node in nodes.items():
-        for name, value in node.attrs.items():
+        for name, value in read_attributes(node).items():
             texts[f"{path}@{name}"] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         if isinstance(node, h5py.Dataset) and node.shape == () and h5py.check_string_dtype(node.dtype):
             texts[path] = node.asstr()[()]

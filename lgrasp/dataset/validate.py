@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from typing import Any
 
 import h5py
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
-from lgrasp.dataset.structure import members, shard_problems, text_sha256
+from lgrasp.dataset.structure import shard_problems, text_sha256
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import object_set_sha256
 
@@ -24,15 +25,17 @@ def validate_shard(path: str | os.PathLike[str]) -> list[str]:
 
 
 def file_problems(
-    path: str | os.PathLike[str], structure: Callable[[h5py.File], list[str]], content: Callable[..., list[str]]
+    path: str | os.PathLike[str],
+    structure: Callable[[h5py.File], tuple[dict[str, Any], list[str]]],
+    content: Callable[..., list[str]],
 ) -> list[str]:
-    """Problems of a file, those of its structure before those of what it holds, by functions of the file and its path;
-    what cannot be read is a problem too."""
+    """Problems of a file, those of its structure before those of what it holds, by functions of the file, which gives
+    its members too, and of its path; what cannot be read is a problem too."""
     try:
         check_heaps(path)
         with open_hdf5(path) as file, reading(path):
-            problems = structure(file)
-            if not problems and "text_sha256" in file.attrs and file.attrs["text_sha256"] != text_sha256(members(file)):
+            nodes, problems = structure(file)
+            if not problems and "text_sha256" in file.attrs and file.attrs["text_sha256"] != text_sha256(nodes):
                 problems = ["/: attributes or texts were changed after writing (text_sha256 differs)"]
         return problems or content(path)
     except ShardError as error:

@@ -36,7 +36,7 @@ class Piece:
     def depth(self, p: np.ndarray) -> np.ndarray:
         """Signed distance of points (n, 3) [m], negative inside; a lower bound outside."""
         if len(self.planes):
-            return (p @ self.planes[:, :3].T - self.planes[:, 3]).max(1) - self.radius
+            return (self.planes[:, :3] @ p.T - self.planes[:, 3:]).max(0) - self.radius  # along points it is fast
         a, b = self.vertices[0], self.vertices[-1]
         ab = b - a
         t = np.clip((p - a) @ ab / max(float(ab @ ab), 1e-30), 0, 1)

@@ -121,8 +121,8 @@ def check_scene(path: str | os.PathLike[str]) -> list[str]:
     return file_problems(path, _problems, lambda path: scene_problems(read_scene(path)))
 
 
-def _problems(file: h5py.File) -> list[str]:
-    """Why a file is no whole scene of a version that this package reads, one line each."""
+def _problems(file: h5py.File) -> tuple[dict[str, Any], list[str]]:
+    """The members of a file, and why it is no whole scene of a version that this package reads, one line each."""
     return whole_problems(file, "scene", FORMAT, FORMAT_VERSION, _structure_problems)
 
 

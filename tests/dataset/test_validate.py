@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from lgrasp.dataset.reader import read_shard
-from lgrasp.dataset.structure import expand
+from lgrasp.dataset.structure import expand, members
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
@@ -110,7 +110,7 @@ def test_wrong_dtype_and_shape_of_every_dataset(path, spec):
 
 @pytest.mark.parametrize("spec", [a for a in ATTRIBUTES if a.required], ids=lambda a: f"{a.path}@{a.name}")
 def test_every_required_attribute_is_required(path, spec):
-    edit(path, lambda file: file[expand(file, spec.path)[0] or "/"].attrs.pop(spec.name))
+    edit(path, lambda file: file[expand(members(file), spec.path)[0] or "/"].attrs.pop(spec.name))
     assert any(spec.name in line for line in validate_shard(path))
 
 

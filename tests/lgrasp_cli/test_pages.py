@@ -21,7 +21,7 @@ from lgrasp.geometry import decompose
 BLOCK = re.compile(r"^(<!-- not run.*?-->\n)?```(bash|python)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FEWER = {
     "build-field": ("-p", QUICK),
-    "generate": ("-n", "4", "--set", "field.records=20000"),  # the field of QUICK
+    "generate": ("-n", "2", "--set", "field.records=20000"),  # the field of QUICK
     "render": ("-n", "2"),
 }
 SETTINGS = PLAIN | {"lgrasp.geometry.decompose._TREE_SEARCH": decompose._TREE_SEARCH | {"threshold": 0.05}}

@@ -3,11 +3,16 @@
 import fcntl
 from pathlib import Path
 
-from lgrasp.runtime.kernels import kernel_modules, load_kernels
+import warp as wp
+
+from lgrasp.runtime.kernel_cache import note_checksums
+from lgrasp.runtime.kernels import kernel_modules
 
 
 def compile_together(folder: Path, *, backwards: bool) -> None:
     """Compile the kernels of all imported modules that no other process compiles; wait for those that one does.
+
+    In this thread: the headers that it compiles, seconds of work, are there for the kernels of tests.
 
     Args:
         folder: the same for all processes of a run.
@@ -22,5 +27,6 @@ def compile_together(folder: Path, *, backwards: bool) -> None:
                 except BlockingIOError:
                     continue
                 if not file.tell():
-                    load_kernels("cpu", [name])
+                    wp.load_module(name, "cpu")
                     file.write(b"done")
+    note_checksums(Path(wp.config.kernel_cache_dir))
