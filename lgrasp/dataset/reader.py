@@ -11,7 +11,6 @@ from typing import Any, Self
 import h5py
 import numpy as np
 
-from lgrasp.dataset.attributes import read_attribute, read_attributes
 from lgrasp.dataset.files import check_heaps, check_regular
 from lgrasp.dataset.structure import expand, format_problems, shard_problems
 from lgrasp.errors import ShardError, short_reason
@@ -83,7 +82,7 @@ class FileReader:
     def attributes(self) -> dict[str, Any]:
         """The root attributes as stored (``config`` is JSON text)."""
         with reading(self.path):
-            return read_attributes(self._file)
+            return dict(self._file.attrs)
 
     @property
     def object_ids(self) -> list[str]:
@@ -97,14 +96,14 @@ class FileReader:
             blobs = [nodes[path] for path in sorted(expand(nodes, "hand/meshes/*"), key=lambda n: (len(n), n))]
             return HandRecord(
                 name=attrs["hand"],
-                base_link=read_attribute(nodes["hand"], "base_link"),
+                base_link=nodes["hand"].attrs["base_link"],
                 urdf=nodes["hand/urdf"].asstr()[()],
                 joint_names=tuple(nodes["hand/joint_names"].asstr()[()]),
                 joint_lower=nodes["hand/joint_lower"][()],
                 joint_upper=nodes["hand/joint_upper"][()],
                 link_names=tuple(nodes["hand/link_names"].asstr()[()]),
                 sha256=attrs["hand_sha256"],
-                meshes={read_attribute(blob, "path"): blob[()].tobytes() for blob in blobs},
+                meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
             )
 
     def object(self, object_id: str) -> ObjectRecord:
@@ -113,7 +112,7 @@ class FileReader:
             if object_id not in self.object_ids:
                 raise ShardError(f"{self.path}: no object {object_id!r}; it has {', '.join(self.object_ids)}")
             here = f"objects/{object_id}"
-            nodes, attrs = self._nodes, read_attributes(self._nodes[here])
+            nodes, attrs = self._nodes, self._nodes[here].attrs
             parts = {name: nodes.get(f"{here}/{name}") for name in ("normals", "tables", "regions")}
             return ObjectRecord(
                 id=object_id,
@@ -135,7 +134,7 @@ class FileReader:
     def statistics(self) -> dict[str, int | float | str]:
         """Counts and seconds, device name."""
         with reading(self.path):
-            attrs = read_attributes(self._nodes["statistics"])
+            attrs = self._nodes["statistics"].attrs
             return {k: v.item() if isinstance(v, np.generic) else v for k, v in sorted(attrs.items())}
 
 
@@ -223,7 +222,7 @@ class ShardReader(FileReader):
         ):
             members = {n.partition("/")[2]: v for n, v in values.items() if n.startswith(f"{group}/")}
             fields[group] = members
-            fields[texts] = {n: read_attribute(self._dataset(f"{group}/{n}"), attribute) for n in members}
+            fields[texts] = {n: self._dataset(f"{group}/{n}").attrs[attribute] for n in members}
         fields["table"] = {n.partition("/")[2]: v for n, v in values.items() if n in TABLE_FIELDS}
         if self.space_names is not None:
             steps = {name.removeprefix("sequence/"): values[name] for name in SEQUENCE_FIELDS}

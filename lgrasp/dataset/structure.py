@@ -11,7 +11,6 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lgrasp.dataset.attributes import has_attribute, read_attribute, read_attributes
 from lgrasp.grasp.schema import (
     ATTRIBUTES,
     DATASETS,
@@ -156,7 +155,7 @@ def schema_problems(
     for attribute in attributes:
         for path in expand(nodes, attribute.path):
             if (owner := nodes.get(path)) is not None:
-                problems += _attribute_problems(owner, path, attribute)
+                problems += _attribute_problems(owner.attrs, path, attribute)
     return problems
 
 
@@ -203,11 +202,11 @@ def _dtype_matches(actual: np.dtype, expected: str) -> bool:
     return actual.kind == want.kind and actual.itemsize == want.itemsize
 
 
-def _attribute_problems(owner: Any, path: str, spec: AttributeSpec) -> list[str]:
+def _attribute_problems(attrs: Any, path: str, spec: AttributeSpec) -> list[str]:
     where = f"{path or '/'}: attribute {spec.name}"
-    if not has_attribute(owner, spec.name):
+    if spec.name not in attrs:
         return [f"{where} is missing"] if spec.required else []
-    value, (what, reads) = read_attribute(owner, spec.name), _KINDS[spec.kind]
+    value, (what, reads) = attrs[spec.name], _KINDS[spec.kind]
     if isinstance(reads, str):
         good = np.ndim(value) == 0 and np.asarray(value).dtype.kind in reads
     else:
@@ -241,7 +240,7 @@ def text_sha256(nodes: Mapping[str, Any]) -> str:
     """
     texts: dict[str, Any] = {}
     for path, node in nodes.items():
-        for name, value in read_attributes(node).items():
+        for name, value in node.attrs.items():
             texts[f"{path}@{name}"] = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
         if isinstance(node, h5py.Dataset) and node.shape == () and h5py.check_string_dtype(node.dtype):
             texts[path] = node.asstr()[()]
