@@ -1,5 +1,6 @@
 """What the benchmarks print sets like beside like."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from lgrasp.bench import sequence
 from lgrasp.bench.page import load_published
 from lgrasp.bench.refine import STEPS, refine_page
 from lgrasp.bench.sequence import bench_methods, sequence_page
+from lgrasp.errors import PhysicsError
 
 
 def plans(valid, seconds):
@@ -79,11 +81,18 @@ def entry(held, strict, seconds, begun=256):
 
 
 @pytest.fixture
-def sequences(monkeypatch):
-    """bench_methods() of two methods whose measurements are given."""
+def job():
     from lgrasp.engine.pipeline import load_pipeline
     from lgrasp.jobs.sequence.job import SequenceJob
 
+    pipeline = load_pipeline("sequence").with_params("sequence", width=256)
+    asked = {"hand": "allegro", "objects": ("mug", "box"), "rows": 1, "out": Path("."), "simulate": "seq6"}
+    return SequenceJob(pipeline=pipeline, **asked)
+
+
+@pytest.fixture
+def sequences(job, monkeypatch):
+    """bench_methods() of two methods whose measurements are given."""
     given = {
         "field": {"begun": 256, "spaces": {"thumb-palm": {"tried": 50, "found": 40, "held": 30}}},
         "anneal": {"begun": 32, "spaces": {}},
@@ -96,13 +105,18 @@ def sequences(monkeypatch):
         widths[params.method] = params.width
         return given[params.method] | {"objects": [entries[params.method]]}
 
+    monkeypatch.setattr(sequence, "check_installed", lambda device, protocol: None)
     monkeypatch.setattr(sequence, "measure_sequence", measured)
     monkeypatch.setattr(sequence, "summary", lambda parts: dict(parts[0]))
-    pipeline = load_pipeline("sequence").with_params("sequence", width=256)
-    job = SequenceJob(hand="allegro", objects=("mug", "box"), rows=1, pipeline=pipeline, out=Path("."), simulate="seq6")
     *_, result = bench_methods([job], ["field", "anneal"], 32, lambda line: None)
     assert widths == {"field": 256, "anneal": 32}
     return result
+
+
+def test_a_missing_simulator_is_told_before_anything_runs(job, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(PhysicsError, match=r"lgrasp\[sim\]"):
+        next(bench_methods([job], ["field"], 32, pytest.fail))
 
 
 def test_ratios_of_methods_by_held_and_by_strict_rows(sequences):
