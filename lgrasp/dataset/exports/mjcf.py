@@ -199,6 +199,7 @@ class MjcfWriter:
     """
 
     def __init__(self, selection: Selection, frames: HandFrames, cut: Cut | None = None) -> None:
+        import_mujoco("mjcf")  # before objects are cut, which takes long
         self._selection, self._frames, self._cut = selection, frames, cut
         self._hand = {f"{HAND}/{name}": data for name, data in hand_files(selection.hand, selection.shards[0]).items()}
         self._object = cache(self._make_object)

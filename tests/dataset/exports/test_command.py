@@ -13,6 +13,7 @@ from support.forked import start_forked
 from support.places import TINY_SHARD
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
+from lgrasp.errors import PhysicsError
 from lgrasp_cli.main import main
 from lgrasp_cli.progress import JobProgress
 
@@ -92,6 +93,8 @@ def test_without_mujoco(cli, tmp_path, shards, monkeypatch):
     code, _, err = cli("a.h5", "--to", "mjcf", "--out", "made")
     assert code == 2
     assert 'pip install "lgrasp[sim]"' in err
+    with pytest.raises(PhysicsError):
+        export_shards([tmp_path / "a.h5"], tmp_path / "made", "mjcf", cut=pytest.fail)
     assert not (tmp_path / "made").exists()
 
 
