@@ -26,8 +26,6 @@ from lgrasp.jobs.sequence.round import Verdicts, run_round
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kernels import kernel_modules, load_kernels
-from lgrasp.simulate.protocol import find_protocol
-from lgrasp.simulate.run import check_installed
 from lgrasp.words import number, plural
 
 _RATES = ("held_per_s", "strict_per_s")
@@ -57,9 +55,8 @@ def bench_methods(
     Raises:
         PhysicsError: the simulator is not installed.
     """
-    device, parts = resolve_device(jobs[0].device), {} if parts is None else parts
-    assert jobs[0].simulate
-    check_installed(device.alias, find_protocol(jobs[0].simulate))
+    jobs[0].check_simulator()
+    parts = {} if parts is None else parts
     asked: dict[str, list[SequenceJob]] = {}
     for method in methods:
         changes: dict[str, Any] = {"method": method} | ({"width": baseline_width} if asked else {})
@@ -71,7 +68,7 @@ def bench_methods(
             ]
     result: dict[str, Any] = {
         "published": load_published("seqgrasp").model_dump(mode="json"),
-        "device": device.name,
+        "device": resolve_device(jobs[0].device).name,
         "sequences": [list(job.objects) for job in jobs],
         "simulate": jobs[0].simulate,
         "parts": parts,

@@ -84,7 +84,7 @@ class FileReader:
         with reading(self.path):
             return dict(self._file.attrs)
 
-    @property
+    @cached_property
     def object_ids(self) -> list[str]:
         """Sorted object ids; ``object_index`` counts in this list."""
         return [path.removeprefix("objects/") for path in expand(self._nodes, "objects/*")]

@@ -61,15 +61,19 @@ class SearchJob(SearchRequest, Job):
 
     def parts(self) -> list[Part]:
         rows, size = self.rows, self.shard_rows
+        self.check_simulator()
+        hand, name = self.keys.source.name, self.object_name
+        return [
+            Part(s, shard_path(self.out, hand, name, s), min(size, rows - s * size)) for s in range(self.known_parts)
+        ]
+
+    def check_simulator(self) -> None:
+        """Raises PhysicsError unless there is a simulator of the protocol, if any, for the device."""
         if self.protocol:
             from lgrasp.simulate.protocol import find_protocol
             from lgrasp.simulate.run import check_installed
 
             check_installed(resolve_device(self.device).alias, find_protocol(self.protocol))
-        hand, name = self.keys.source.name, self.object_name
-        return [
-            Part(s, shard_path(self.out, hand, name, s), min(size, rows - s * size)) for s in range(self.known_parts)
-        ]
 
     def load(self, events: Events, missing: bool) -> None:
         if missing:

@@ -105,7 +105,7 @@ def sequences(job, monkeypatch):
         widths[params.method] = params.width
         return given[params.method] | {"objects": [entries[params.method]]}
 
-    monkeypatch.setattr(sequence, "check_installed", lambda device, protocol: None)
+    monkeypatch.setattr(type(job), "check_simulator", lambda job: None)
     monkeypatch.setattr(sequence, "measure_sequence", measured)
     monkeypatch.setattr(sequence, "summary", lambda parts: dict(parts[0]))
     *_, result = bench_methods([job], ["field", "anneal"], 32, lambda line: None)
