@@ -30,7 +30,7 @@ ProtocolName = Literal[
     *("fc_random", "lift", "dipgrasp"),
 ]
 """Protocols of the simulation (:mod:`lgrasp.simulate.protocol`)."""
-EngineName = Literal["mujoco", "physx"]
+EngineName = Literal["mujoco", "physx", "drake"]
 """Simulators."""
 VERDICTS: dict[str, tuple[ProtocolName, EngineName]] = {
     protocol if engine == "mujoco" else f"{engine}_{protocol}": (protocol, engine)

@@ -8,7 +8,7 @@ out. Nothing pulls at the hand's own links: the controller carries them.
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,10 +19,7 @@ from lgrasp.simulate.model import Model
 from lgrasp.simulate.protocol import GRAVITY, FreeLift, Lift, Protocol, Shake
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.verdict import AXES, Bounds, Look, Verdict, at_rest, chunk_of, moved
-
-if TYPE_CHECKING:
-    from lgrasp.simulate.mujoco_world import MujocoWorld
-    from lgrasp.simulate.physx_world import PhysxWorld
+from lgrasp.simulate.world import World
 
 _ORDER = (0, 2, 4, 1, 3, 5)  # of AXES: each at a right angle to the one before
 _WAVES = 4  # of each axis
@@ -144,7 +141,7 @@ def _turns(lift: FreeLift, steps: int, candidate: int) -> np.ndarray:
     return ways[np.arange(steps) * lift.turns // steps] if lift.turns else ways
 
 
-def lift_row(world: "MujocoWorld | PhysxWorld", model: Model, rows: GraspRows, i: int) -> Lifted:
+def lift_row(world: World, model: Model, rows: GraspRows, i: int) -> Lifted:
     """Simulate row ``i``, whose object has the planes of ``model``."""
     protocol, pose = model.protocol, rows.object_pose[i].astype(float)
     stops = [targets[i].astype(float) for targets in protocol.stops(rows)]
@@ -165,7 +162,7 @@ def lift_row(world: "MujocoWorld | PhysxWorld", model: Model, rows: GraspRows, i
     return _carry(world, model, course._replace(way=course.way @ turn.T, down=course.down @ turn.T), home)
 
 
-def _carry(world: "MujocoWorld | PhysxWorld", model: Model, course: LiftCourse, home: np.ndarray) -> Lifted:
+def _carry(world: World, model: Model, course: LiftCourse, home: np.ndarray) -> Lifted:
     """Go through a course from where everything stands.
 
     Args:

@@ -164,6 +164,11 @@ def leaders(model: Any, joints: Iterable[int]) -> list[tuple[int, float, float]]
     return found
 
 
+def pairs_apart(model: Any) -> list[tuple[int, int]]:
+    """Bodies that an MjModel has never collide: neighbours, and those that always touch."""
+    return [divmod(int(signature), 1 << 16) for signature in model.exclude_signature]
+
+
 def _table_of(model: Any) -> TableBody:
     body = model.body(TABLE)
     joint = int(body.jntadr[0])

@@ -1,15 +1,16 @@
-"""One hand and its objects in MuJoCo: set, driven, pushed, stepped and read."""
+"""The world in MuJoCo."""
 
 from typing import Any
 
 import numpy as np
 
 from lgrasp.simulate.model import Model
-from lgrasp.simulate.verdict import WILD, links_touching
+from lgrasp.simulate.verdict import WILD, links_touching, touches_table
+from lgrasp.simulate.world import World
 
 
-class MujocoWorld:
-    """A simulation of one thread; O objects, B bodies as MuJoCo counts them.
+class MujocoWorld(World):
+    """A MuJoCo model and its data.
 
     Args:
         model: O objects in the order of the rows.
@@ -41,61 +42,52 @@ class MujocoWorld:
         lib.mj_collision(self._m, data)
 
     def drive(self, targets: np.ndarray) -> None:
-        """Set the targets of the drives (nu,) [rad or m]."""
         self.data.ctrl[:] = targets
 
     def push(self, forces: np.ndarray) -> None:
-        """Pull on the objects' centres of mass from now on (O, 3) [N], world frame."""
         self.data.xfrc_applied[self._model.object_body, :3] = forces
 
     def place_table(self, pose: np.ndarray) -> None:
-        """Put the table, whose top is z = 0 of its frame, at a pose (7,) in the world."""
         self.data.qpos[self._model.table.address] = self._table = np.array(pose, float)
 
     def slide_table(self, by: np.ndarray) -> None:
-        """In the next step the table moves by a vector (3,) [m] and nothing else, whatever presses on it."""
         table = self._model.table
         self.data.qpos[table.address] = self._table
         self.data.qvel[table.velocity] = [*(by / self._m.opt.timestep), 0, 0, 0]
         self._table[:3] += by
 
     def step(self, steps: int) -> None:
-        """Go on for some steps of the protocol."""
         self._lib.mj_step(self._m, self.data, steps)
 
     def state(self) -> np.ndarray:
-        """Everything that decides what comes next."""
         spec = self._lib.mjtState.mjSTATE_INTEGRATION
         state = np.zeros(self._lib.mj_stateSize(self._m, spec))
         self._lib.mj_getState(self._m, self.data, state, spec)
         return state
 
     def restore(self, state: np.ndarray) -> None:
-        """Inverse of :meth:`state`."""
         self._lib.mj_setState(self._m, self.data, state, self._lib.mjtState.mjSTATE_INTEGRATION)
 
     def objects(self) -> np.ndarray:
-        """Poses of the objects (O, 7)."""
         return self.data.qpos[self._model.object_address]
 
     def velocities(self) -> np.ndarray:
-        """Linear [m/s] and angular [rad/s] velocities of the objects (O, 6)."""
         return self.data.qvel[self._model.object_velocity]
 
+    def hand_joints(self) -> np.ndarray:
+        return self.data.qpos[self._model.joint_address]
+
     def frames(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (B, 3) [m] and rotations (B, 3, 3) of the bodies in the world."""
         self._lib.mj_kinematics(self._m, self.data)
         return self.data.xpos, self.data.xmat.reshape(-1, 3, 3)
 
     def links_touching(self) -> np.ndarray:
-        """Number of the hand's bodies in contact with each object (O,)."""
         bodies = self._m.geom_bodyid[self.data.contact.geom]
         return links_touching(bodies, self._model.object_body, self._m.nbody)
 
     def on_table(self) -> bool:
-        """Whether an object touches the table."""
         bodies = self._m.geom_bodyid[self.data.contact.geom[self.data.contact.dist < 0]]
-        return bool(((bodies == self._model.table.body).any(1) & np.isin(bodies, self._model.object_body).any(1)).any())
+        return touches_table(bodies, self._model.table.body, self._model.object_body)
 
     def deepest(self, *, of_links: bool = False) -> float:
         """Deepest penetration of any object, in a link or in another object; of links in links too if asked [m]."""
@@ -104,5 +96,4 @@ class MujocoWorld:
         return max(0.0, -float(contact.dist[chosen].min(initial=0.0)))
 
     def wild(self) -> bool:
-        """True if the simulation has diverged."""
         return not np.abs(self.data.qvel).max() < WILD or not np.isfinite(self.data.qpos).all()

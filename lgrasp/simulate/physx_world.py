@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
 from lgrasp.runtime.optional import import_mujoco, import_optional
-from lgrasp.simulate.model import Model, leaders
-from lgrasp.simulate.verdict import WILD, links_touching
+from lgrasp.simulate.model import Model, leaders, pairs_apart
+from lgrasp.simulate.verdict import WILD, links_touching, touches_table
+from lgrasp.simulate.world import World
 
 CONTACT_OFFSET = 0.002
 """Shapes closer than this have contact points, which press when they are closer than 0 [m]."""
@@ -70,12 +71,11 @@ def _recorded(act: Callable[..., None]) -> Callable[..., None]:
     return recorded
 
 
-class PhysxWorld:
+class PhysxWorld(World):
     """A PhysX scene made of what MuJoCo compiled: its bodies, inertias, shapes, joints and drives, number by number.
 
-    The interface is that of :class:`lgrasp.simulate.mujoco_world.MujocoWorld`. Contacts are hard; friction
-    acts at the points of a contact patch without torsional term, and joints that one drive moves share it and are held
-    to their mean.
+    Contacts are hard; friction acts at the points of a contact patch without torsional term, and joints that one drive
+    moves share it and are held to their mean.
 
     Args:
         model: O objects in the order of the rows.
@@ -91,7 +91,6 @@ class PhysxWorld:
 
     @_recorded
     def begin(self, q: np.ndarray, poses: np.ndarray) -> None:
-        """Hand at q (K,), objects at poses (O, 7) in the base frame, everything at rest."""
         del self._past[:-1]
         self._make()
         model = self._model
@@ -100,7 +99,7 @@ class PhysxWorld:
         self._hand.set_qpos(positions)
         self._hand.set_qvel(np.zeros_like(positions))
         self._aim(model.controls(q))
-        base = self.links[model.base_body].entity.pose
+        base = self._links[model.base_body].entity.pose
         for component, pose in zip(self._objects, poses.astype(float), strict=True):
             component.entity.pose = base * self._sapien.Pose(pose[:3], pose[3:] / np.linalg.norm(pose[3:]))
             component.set_linear_velocity(np.zeros(3))
@@ -108,7 +107,6 @@ class PhysxWorld:
 
     @_recorded
     def drive(self, targets: np.ndarray) -> None:
-        """Set the targets of the drives (nu,) [rad or m]."""
         self._aim(targets)
 
     def _aim(self, targets: np.ndarray) -> None:
@@ -120,24 +118,25 @@ class PhysxWorld:
 
     @_recorded
     def push(self, forces: np.ndarray) -> None:
-        """Pull on the objects' centres of mass from now on (O, 3) [N], world frame."""
         self._forces[:] = forces
+
+    def press(self, loads: dict[int, tuple[np.ndarray, np.ndarray]]) -> None:
+        """Forces (3,) [N] on the centres of mass of links, and torques (3,) [N m], in the next step, world frame."""
+        for body, (force, torque) in loads.items():
+            self._links[body].add_force_torque(force, torque)
 
     @_recorded
     def place_table(self, pose: np.ndarray) -> None:
-        """Put the table, whose top is z = 0 of its frame, at a pose (7,) in the world."""
         self._table.entity.pose = self._sapien.Pose(pose[:3], pose[3:])
         self._table_pose = np.array(pose, float)
 
     @_recorded
     def slide_table(self, by: np.ndarray) -> None:
-        """In the next step the table moves by a vector (3,) [m] and nothing else, whatever presses on it."""
         self._table_pose[:3] += by
         self._table.set_kinematic_target(self._sapien.Pose(self._table_pose[:3], self._table_pose[3:]))
 
     @_recorded
     def step(self, steps: int) -> None:
-        """Go on for some steps of the protocol."""
         for _ in range(steps):
             for component, force in zip(self._objects, self._forces, strict=True):
                 component.add_force_torque(force, np.zeros(3))
@@ -172,21 +171,17 @@ class PhysxWorld:
             act(self, *args)
 
     def objects(self) -> np.ndarray:
-        """Poses of the objects (O, 7)."""
         poses = [component.entity.pose for component in self._objects]
         return np.array([[*pose.p, *pose.q] for pose in poses], float)
 
     def velocities(self) -> np.ndarray:
-        """Linear [m/s] and angular [rad/s] velocities of the objects (O, 6)."""
         found = [[*c.get_linear_velocity(), *c.get_angular_velocity()] for c in self._objects]
         return np.array(found, float)
 
     def hand_joints(self) -> np.ndarray:
-        """Positions of the hand's joints in the order of the model (J,) [rad or m]."""
         return np.asarray(self._hand.get_qpos(), float)[self._column]
 
     def frames(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (B, 3) [m] and rotations (B, 3, 3) of the bodies in the world."""
         at, turn = np.zeros((self._m.nbody, 3)), np.tile(np.eye(3), (self._m.nbody, 1, 1))
         for component, body in self._number.items():
             pose = component.entity.pose
@@ -194,21 +189,16 @@ class PhysxWorld:
         return at, turn
 
     def links_touching(self) -> np.ndarray:
-        """Number of the hand's bodies in contact with each object (O,)."""
         return links_touching(self._touching(), self._model.object_body, self._m.nbody)
 
     def on_table(self) -> bool:
-        """Whether an object touches the table."""
-        bodies, objects = self._touching(), self._model.object_body
-        return bool(((bodies == self._model.table.body).any(1) & np.isin(bodies, objects).any(1)).any())
+        return touches_table(self._touching(), self._model.table.body, self._model.object_body)
 
     def deepest(self) -> float:
-        """Deepest penetration of any object, in a link or in another object [m]."""
         own = set(self._model.object_body.tolist())
         return max([0.0, *(-apart for pair, apart in self._contacts() if own & {*pair})])
 
     def wild(self) -> bool:
-        """True if the simulation has diverged."""
         speed = np.concatenate([self.velocities().ravel(), self._hand.get_qvel()])
         return not np.abs(speed).max() < WILD
 
@@ -240,17 +230,17 @@ class PhysxWorld:
         friction = float(m.geom_friction[:, 0].max())
         self._material = px.PhysxMaterial(friction, friction, 0.0)
         self._objects: list[Any] = []
-        self.links: dict[int, Any] = {}
+        self._links: dict[int, Any] = {}
         self._build()
-        self._number = {component: body for body, component in self.links.items()}
+        self._number = {component: body for body, component in self._links.items()}
         self._number |= {c: int(b) for b, c in zip(model.object_body, self._objects, strict=True)}
         if model.table.body >= 0:
             self._number[self._table] = model.table.body
-        self._hand = self.links[0].articulation
+        self._hand = self._links[0].articulation
         self._joints = list(self._hand.get_active_joints())
         order = {joint.child_link: k for k, joint in enumerate(self._joints)}
         hand_joints = [j for j in range(m.njnt) if m.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
-        self._column = np.array([order[self.links[int(m.jnt_bodyid[j])]] for j in hand_joints])
+        self._column = np.array([order[self._links[int(m.jnt_bodyid[j])]] for j in hand_joints])
         row = {j: k for k, j in enumerate(hand_joints)}
         self._driven = [self._joints[self._column[row[int(m.actuator_trnid[a, 0])]]] for a in range(m.nu)]
         self._coupled: list[_Coupled] = []
@@ -261,8 +251,7 @@ class PhysxWorld:
     def _ignore_groups(self) -> np.ndarray:
         """A bit for each pair of bodies that must not collide (B,), but for neighbours, which PhysX leaves out."""
         m = self._m
-        pairs = [divmod(int(signature), 1 << 16) for signature in m.exclude_signature]
-        pairs = [(a, b) for a, b in pairs if m.body_parentid[a] != b and m.body_parentid[b] != a]
+        pairs = [(a, b) for a, b in pairs_apart(m) if m.body_parentid[a] != b and m.body_parentid[b] != a]
         if len(pairs) > 32:
             raise PhysicsError(f"PhysX: {len(pairs)} pairs of links that must not collide; at most 32 can be told")
         bits = np.zeros(m.nbody, np.int64)
@@ -284,9 +273,9 @@ class PhysxWorld:
                 component.kinematic = True
                 entity.pose = sapien.Pose(m.body_pos[body])
             else:
-                parent = self.links[int(m.body_parentid[body])] if body else None
+                parent = self._links[int(m.body_parentid[body])] if body else None
                 component = px.PhysxArticulationLinkComponent(parent)
-                self.links[body] = component
+                self._links[body] = component
                 self._join(body, component)
             self._add_shapes(body, component)
             if body:

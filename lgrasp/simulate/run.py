@@ -16,9 +16,9 @@ from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.runtime.processes import ProcessPool, none_killed
+from lgrasp.simulate.engines import check_engine, engine_text
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.model import Model, build_model
-from lgrasp.simulate.physx_world import SOLVER, import_physx
 from lgrasp.simulate.protocol import PROTOCOLS, Protocol
 from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.trial import Trial
@@ -106,10 +106,10 @@ def verdicts(
         scene: hand and objects of the rows.
         rows: N grasps of O objects at most; K columns of q and contacts as in a shard.
         protocol: what is simulated.
-        threads: grasps simulated at a time; those of PhysX, which lets a process simulate one at a time, in processes.
+        threads: grasps simulated at a time; in processes where Python works between steps (PhysX, Drake).
         progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
         all_directions: continue after the first direction in which an object is lost.
-        device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0); PhysX runs on the CPU.
+        device: cpu, or a GPU on which MuJoCo Warp simulates many grasps side by side (cuda:0); others run on the CPU.
         keep: called with (kind, key, make), gives what it made for the key before, or makes it: what a GPU is given,
             and processes, then serve further calls.
         prepared: called with the seconds that models and, on a GPU, kernels took to be made.
@@ -138,7 +138,7 @@ def verdicts(
             prepared(time.perf_counter() - begin)
         if worlds:
             some = worlds.run(group.rows, advanced)
-        elif protocol.engine == "physx" and threads > 1 and len(group.rows) > _FEW:
+        elif protocol.engine != "mujoco" and threads > 1 and len(group.rows) > _FEW:
             some = _in_processes(model, group.rows, threads, advanced, all_directions, keep)
         else:
             some = _on_threads(model, group.rows, threads, advanced, all_directions)
@@ -149,17 +149,15 @@ def verdicts(
 
 
 def on_cpu(device: str, protocol: Protocol) -> bool:
-    """Whether a protocol runs on the CPU, as PhysX always does."""
-    return device == "cpu" or protocol.engine == "physx"
+    """Whether a protocol runs on the CPU, as those of all simulators but MuJoCo do."""
+    return device == "cpu" or protocol.engine != "mujoco"
 
 
 def check_installed(device: str, protocol: Protocol) -> None:
     """Raises PhysicsError unless there is a simulator of a protocol for a device."""
     _check_device(device, protocol)
-    import_mujoco()
-    if protocol.engine == "physx":
-        import_physx()
-    elif device != "cpu":
+    check_engine(protocol.engine)
+    if not on_cpu(device, protocol):
         import_mujoco_warp()
 
 
@@ -268,11 +266,7 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
         | protocol.load(solid.volume).model_dump(exclude={"mass", "stiffness"} if protocol.draws else None)
         for solid in scene.objects
     ]
-    more: dict[str, Any] = {}
-    if protocol.engine == "physx":
-        simulator, more = f"physx by sapien {import_physx().__version__}", {"solver": SOLVER}
-    else:
-        simulator = f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}"
+    simulator, more = engine_text(protocol.engine, device)
     return protocol.text(
         simulator=simulator,
         all_directions=all_directions,

@@ -6,6 +6,7 @@ import numpy as np
 
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.draws import draw_of, tune
+from lgrasp.simulate.engines import make_world
 from lgrasp.simulate.lift import Lifted, conclude_lift, lift_row, shake_course
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.mujoco_world import MujocoWorld
@@ -23,6 +24,7 @@ from lgrasp.simulate.verdict import (
     moved,
     worst,
 )
+from lgrasp.simulate.world import World
 
 
 class Trial:
@@ -37,11 +39,7 @@ class Trial:
         self._compiled, self._protocol = model, model.protocol
         self._model = model = model.own() if self._protocol.draws else model
         self._near, self._still = MujocoWorld(model, near=True), MujocoWorld(model)
-        self._world = self._still
-        if self._protocol.engine == "physx":
-            from lgrasp.simulate.physx_world import PhysxWorld
-
-            self._world = PhysxWorld(model)
+        self._world: World = self._still if self._protocol.engine == "mujoco" else make_world(model)
         self._all = all_directions
         self._timestep = model.mujoco.opt.timestep
         self._chunk = self._steps(chunk_of(self._protocol))

@@ -139,7 +139,7 @@ class Bounds:
 
 def chunk_of(protocol: Protocol) -> float:
     """Time between looks [s]."""
-    return LONG_CHUNK if protocol.engine == "physx" or protocol.lift else CHUNK
+    return LONG_CHUNK if protocol.engine != "mujoco" or protocol.lift else CHUNK
 
 
 def conclude(bounds: Bounds, look: Look, closed: Closed, pulls: Pulls, diverged: Any) -> Verdict:
@@ -216,6 +216,11 @@ def links_touching(bodies: np.ndarray, objects: np.ndarray, count: int) -> np.nd
         others = np.unique(bodies[(bodies == body).any(1)].sum(1) - body)
         found[number] = hand[others].sum()
     return found
+
+
+def touches_table(bodies: np.ndarray, table: int, objects: np.ndarray) -> bool:
+    """Whether an object touches the table; arguments as of :func:`links_touching`."""
+    return bool(((bodies == table).any(1) & np.isin(bodies, objects).any(1)).any())
 
 
 COLUMNS: dict[str, str] = {

@@ -1,9 +1,11 @@
 import pytest
 
+PACKAGES = {"mujoco": "mujoco", "physx": "sapien", "drake": "pydrake"}
 
-@pytest.fixture(params=["mujoco", "physx"])
+
+@pytest.fixture(params=PACKAGES)
 def engine(request):
     """Each simulator."""
-    if request.param == "physx":
-        pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
-    return request.param
+    name = request.param
+    pytest.importorskip(PACKAGES[name], reason=f"{name} is not installed (extra {name})", exc_type=ImportError)
+    return name

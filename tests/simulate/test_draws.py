@@ -28,12 +28,10 @@ STIFFNESS = 3.0 / RANDOM.lever**2  # [N/m] of a jaw, least
 NUMBERS = ("friction", "torsion", "mass", "stiffness", "damping_ratio", "softness")
 
 
-@pytest.fixture(params=["mujoco", "physx"])
-def fc_random(request):
+@pytest.fixture
+def fc_random(engine):
     """The protocol with two draws in each simulator."""
-    if request.param == "physx":
-        pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
-    return drawing(count=2).by(request.param)
+    return drawing(count=2).by(engine)
 
 
 def drawing(**draws) -> Protocol:

@@ -1,4 +1,4 @@
-"""PhysX is given what MuJoCo is given: every body at its place, and drives and couplings that go the same way."""
+"""Every simulator is given what MuJoCo is given: bodies at their places, drives and couplings that go the same way."""
 
 import numpy as np
 import pytest
@@ -6,32 +6,39 @@ import trimesh
 from support.jaws import mesh_record, shipped_hand
 from support.solids import no_cut
 
+from lgrasp.simulate.engines import make_world
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.mujoco_world import MujocoWorld
-from lgrasp.simulate.physx_world import PhysxWorld
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.scene import Scene, hand_of_record
 from lgrasp.simulate.solid import object_of_record
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
-pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
 
 
-def worlds(name: str):
-    """The model of a shipped hand with a cube far away, the hand's tree, and the model in MuJoCo and in PhysX."""
+@pytest.fixture
+def other(engine):
+    """Each simulator but MuJoCo."""
+    if engine == "mujoco":
+        pytest.skip("the others are compared with it")
+    return engine
+
+
+def worlds(name: str, engine: str):
+    """The model of a shipped hand with a cube far away, the hand's tree, and the model in MuJoCo and in another one."""
     record, _, tree = shipped_hand(name)
     cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
     q = tree.listed_values(tree.joint_open[None])[0]
-    model = build_model(Scene(hand_of_record(record, no_cut), (cube,)), PROTOCOLS["fc"], q)
-    both = MujocoWorld(model), PhysxWorld(model)
+    model = build_model(Scene(hand_of_record(record, no_cut), (cube,)), PROTOCOLS["fc"].by(engine), q)
+    both = MujocoWorld(model), make_world(model)
     for world in both:
         world.begin(q, np.array([[1.0, 2.0, 3.0, 0.5, 0.5, -0.5, 0.5]]))
     return model, tree, *both
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett", "schunk_svh", "shadow"])
-def test_the_hand_goes_where_mujoco_puts_it(name: str):
-    model, tree, *both = worlds(name)
+def test_the_hand_goes_where_mujoco_puts_it(name: str, other: str):
+    model, tree, *both = worlds(name, other)
     span = 0.15 * (tree.joint_upper - tree.joint_open)
     target = tree.listed_values((tree.joint_open + span)[None].astype("f4"))[0]
     for steps, atol in ((0, 1e-5), (150, 1.5e-3)):
@@ -39,18 +46,18 @@ def test_the_hand_goes_where_mujoco_puts_it(name: str):
             if steps:
                 world.drive(model.controls(target))
                 world.step(steps)
-        (at, turn), (at_physx, turn_physx) = (world.frames() for world in both)
-        np.testing.assert_allclose(at_physx, at, atol=atol)
-        np.testing.assert_allclose(turn_physx, turn, atol=20 * atol)
+        (at, turn), (at_other, turn_other) = (world.frames() for world in both)
+        np.testing.assert_allclose(at_other, at, atol=atol)
+        np.testing.assert_allclose(turn_other, turn, atol=20 * atol)
         np.testing.assert_allclose(both[1].objects(), both[0].objects(), atol=1e-5)
 
 
-def test_what_was_tried_leaves_no_trace(jaws):
+def test_what_was_tried_leaves_no_trace(jaws, other: str):
     """A gripper that squeezes a cube goes on alike, whether states were restored on the way or not."""
     shard = jaws.shard()
     rows, scene = shard.grasps, Scene(hand_of_record(shard.hand, no_cut), (object_of_record(shard.objects[0]),))
-    model = build_model(scene, PROTOCOLS["fc"], rows.q[0])
-    world = PhysxWorld(model)
+    model = build_model(scene, PROTOCOLS["fc"].by(other), rows.q[0])
+    world = make_world(model)
     tilted = rows.object_pose[0] + np.array([0, 0.003, 0.002, 0, 0.02, 0.03, 0.01])
 
     def poses(tries: int) -> np.ndarray:
@@ -71,15 +78,15 @@ def test_what_was_tried_leaves_no_trace(jaws):
 
 
 @pytest.mark.parametrize("name", ["barrett", "schunk_svh"])
-def test_joints_of_one_drive_give_way_together(name: str):
+def test_joints_of_one_drive_give_way_together(name: str, other: str):
     """Every link of a hand twisted by 0.03 N m: joints turn as the torques on all joints of their drive have it."""
-    model, tree, mujoco_world, physx_world = worlds(name)
+    model, tree, mujoco_world, other_world = worlds(name, other)
     posture = tree.listed_values((tree.joint_open + 0.2 * (tree.joint_upper - tree.joint_open))[None].astype("f4"))[0]
     m, data, torque = model.mujoco, mujoco_world.data, np.array([0.03, 0.03, 0.0])
     hand = [body for body in range(1, m.nbody) if body not in model.object_body]
-    for world in (mujoco_world, physx_world):
+    for world in (mujoco_world, other_world):
         world.begin(posture, np.array([[1.0, 2.0, 3.0, 1, 0, 0, 0]]))
-    rest, turning = data.qpos[model.joint_address].copy(), np.zeros(m.nv)
+    rest, turning = mujoco_world.hand_joints().copy(), np.zeros(m.nv)
     for body in hand:
         spin = np.zeros((3, m.nv))
         mujoco.mj_jacBody(m, data, None, spin, body)
@@ -90,11 +97,10 @@ def test_joints_of_one_drive_give_way_together(name: str):
     data.xfrc_applied[hand, 3:] = torque
     mujoco_world.step(300)
     for _ in range(300):
-        for body in hand:
-            physx_world.links[body].add_force_torque(np.zeros(3), torque)
-        physx_world.step(1)
-    moved, moved_physx = data.qpos[model.joint_address] - rest, physx_world.hand_joints() - rest
+        other_world.press({body: (np.zeros(3), torque) for body in hand})
+        other_world.step(1)
+    moved, moved_other = mujoco_world.hand_joints() - rest, other_world.hand_joints() - rest
     most = np.abs(wanted).max()
     assert most > 0.01
     np.testing.assert_allclose(moved, wanted, atol=0.03 * most)
-    np.testing.assert_allclose(moved_physx, wanted, rtol=0.2, atol=0.1 * most)
+    np.testing.assert_allclose(moved_other, wanted, rtol=0.2, atol=0.1 * most)
