@@ -31,7 +31,7 @@ def simulate(
     The hand closes on the objects, which move freely and are then pulled in six directions; a grasp holds if they stay.
     docs/guides/physics.md describes each protocol. Shards with the verdicts stay as they are.
 
-    In PhysX (extra physx) contacts are hard; its columns are physics/physx_PROTOCOL_....
+    PhysX (extra physx) has hard contacts, Drake (extra drake) contact patches; columns are physics/ENGINE_PROTOCOL_...
 
     Example: lgrasp simulate grasps/allegro-mug/robust --protocol fc
     """

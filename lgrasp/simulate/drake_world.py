@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 
+from lgrasp.errors import PhysicsError, short_reason
 from lgrasp.runtime.optional import import_mujoco, import_optional
-from lgrasp.simulate.model import Model, leaders, pairs_apart
+from lgrasp.simulate.model import Model, effort_limit, leaders, pairs_apart
 from lgrasp.simulate.verdict import WILD, links_touching, touches_table
 from lgrasp.simulate.world import World
 
@@ -46,6 +47,9 @@ class DrakeWorld(World):
 
     Args:
         model: O objects in the order of the rows.
+
+    Raises:
+        PhysicsError: Drake is missing or refuses a body; its reason is in the message.
     """
 
     def __init__(self, model: Model) -> None:
@@ -158,6 +162,12 @@ class DrakeWorld(World):
 
     def _make(self) -> None:
         """The plant with the numbers that the model has now."""
+        try:
+            self._build()
+        except RuntimeError as error:
+            raise PhysicsError(f"Drake refuses the hand or an object: {short_reason(error, 300)}") from None
+
+    def _build(self) -> None:
         drake, model, m = self._drake, self._model, self._m
         builder = drake.systems.framework.DiagramBuilder()
         config = drake.multibody.plant.MultibodyPlantConfig(
@@ -261,11 +271,11 @@ class DrakeWorld(World):
         )
 
     def _drive(self) -> None:
-        """Inertia of every joint's drive, control of those that are driven, couplings of the others."""
+        """Inertia and effort limit of every joint's drive, control of those driven, couplings of the others."""
         m, driven = self._m, {int(j): a for a, j in enumerate(self._m.actuator_trnid[:, 0])}
         self._actuators = np.array([driven.get(j, -1) for j in self._joints])
         for (j, joint), (leader, factor, offset) in zip(self._joints.items(), leaders(m, self._joints), strict=True):
-            actuator = self._plant.AddJointActuator(f"drive {j}", joint)
+            actuator = self._plant.AddJointActuator(f"drive {j}", joint, effort_limit(m, j))
             actuator.set_default_rotor_inertia(float(m.dof_armature[m.jnt_dofadr[j]]))
             if j in driven:
                 gain, damping = m.actuator_gainprm[driven[j], 0], -m.actuator_biasprm[driven[j], 2]

@@ -164,6 +164,11 @@ def leaders(model: Any, joints: Iterable[int]) -> list[tuple[int, float, float]]
     return found
 
 
+def effort_limit(model: Any, joint: int) -> float:
+    """What the drive of a joint of an MjModel can press with at most [N m or N]; infinite: no limit."""
+    return float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else np.inf
+
+
 def pairs_apart(model: Any) -> list[tuple[int, int]]:
     """Bodies that an MjModel has never collide: neighbours, and those that always touch."""
     return [divmod(int(signature), 1 << 16) for signature in model.exclude_signature]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
 from lgrasp.runtime.optional import import_mujoco, import_optional
-from lgrasp.simulate.model import Model, leaders, pairs_apart
+from lgrasp.simulate.model import Model, effort_limit, leaders, pairs_apart
 from lgrasp.simulate.verdict import WILD, links_touching, touches_table
 from lgrasp.simulate.world import World
 
@@ -30,6 +30,7 @@ SOLVER = {
 
 _COUPLING = 5.0  # stiffness with which joints of one drive are held together, over that of the drive
 _AHEAD = 0.8  # of the motion in one step, that coupled joints are expected to go on with
+_NO_LIMIT = 3.0e38  # of a drive
 _ROTATE_X_TO_Z = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # w x y z: PhysX's capsules lie along x, MuJoCo's along z
 
 
@@ -313,7 +314,7 @@ class PhysxWorld(World):
         joint.set_friction(0.0)
         driven = np.flatnonzero(m.actuator_trnid[:, 0] == j)
         if len(driven):
-            joint.set_drive_property(*self._gains(int(driven[0])))
+            joint.set_drive_property(*self._gains(int(driven[0])), min(effort_limit(m, j), _NO_LIMIT))
 
     def _add_shapes(self, body: int, component: Any) -> None:
         sapien, px, m = self._sapien, self._px, self._m

@@ -64,15 +64,16 @@ def test_adds_columns_and_keeps_the_rest(cli, grasps, tmp_path, raw_grasps, plac
         assert after.statistics["fc_held"] == sum(holds)
 
 
-def test_a_second_simulator_adds_its_own_columns(cli, grasps):
-    pytest.importorskip("sapien", reason="PhysX is not installed (extra physx)", exc_type=ImportError)
-    for engine in ("mujoco", "physx", "physx"):
-        result = cli("simulate", grasps, "--engine", engine)
+@pytest.mark.parametrize(("engine", "package"), [("physx", "sapien"), ("drake", "pydrake")])
+def test_another_simulator_adds_its_own_columns(cli, grasps, engine: str, package: str):
+    pytest.importorskip(package, reason=f"{engine} is not installed (extra {engine})", exc_type=ImportError)
+    for name in ("mujoco", engine, engine):
+        result = cli("simulate", grasps, "--engine", name)
         assert result.code == 0, result
     rows = read_shard(grasps / "jaws-cube-00000.h5").grasps
-    assert rows.physics["fc_holds"].tolist() == rows.physics["physx_fc_holds"].tolist() == [True]
-    protocol = json.loads(rows.physics_protocols["physx_fc_holds"])
-    assert (protocol["engine"], protocol["simulator"][:5]) == ("physx", "physx")
+    assert rows.physics["fc_holds"].tolist() == rows.physics[f"{engine}_fc_holds"].tolist() == [True]
+    protocol = json.loads(rows.physics_protocols[f"{engine}_fc_holds"])
+    assert (protocol["engine"], protocol["simulator"][:5]) == (engine, engine)
     assert "torsion" in protocol["solver"]["not_used"]
     assert json.loads(rows.physics_protocols["fc_holds"])["engine"] == "mujoco"
     assert cli("simulate", grasps, "--engine", "bullet").code == 2

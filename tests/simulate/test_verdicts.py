@@ -43,6 +43,15 @@ def test_friction_of_two_jaws(jaws: Jaws, fc, normal: float):
     assert ((give > 0.98) & (give < 2.3)).all()
 
 
+@pytest.mark.parametrize("effort", [0.6, 1.1])
+def test_jaws_press_no_harder_than_their_effort(jaws: Jaws, fc, effort: float):
+    """Targets that ask for 4 N of each jaw: the URDF's effort limit [N] decides, as the normal force above."""
+    shard = jaws.shard()
+    weak = shard.hand.urdf.replace('effort="100"', f'effort="{effort}"')
+    found = judge(jaws.shard(press(4.0), urdf=weak), fc)
+    assert found["holds"] == [2 * FC.friction * effort > FC.force]
+
+
 def test_stops_at_the_first_loss(jaws: Jaws):
     found = judge(jaws.shard(press(0.5)), FC)
     np.testing.assert_array_equal(found["directions"][0], [1, 1, 0, -1, -1, -1])

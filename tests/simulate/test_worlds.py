@@ -6,6 +6,7 @@ import trimesh
 from support.jaws import mesh_record, shipped_hand
 from support.solids import no_cut
 
+from lgrasp.errors import PhysicsError
 from lgrasp.simulate.engines import make_world
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.mujoco_world import MujocoWorld
@@ -75,6 +76,16 @@ def test_what_was_tried_leaves_no_trace(jaws, other: str):
         return np.concatenate([world.objects().ravel(), world.hand_joints()])
 
     np.testing.assert_array_equal(poses(2), poses(0))
+
+
+def test_what_drake_refuses_is_one_line(jaws):
+    pytest.importorskip("pydrake", reason="drake is not installed (extra drake)")
+    shard = jaws.shard()
+    scene = Scene(hand_of_record(shard.hand, no_cut), (object_of_record(shard.objects[0]),))
+    model = build_model(scene, PROTOCOLS["fc"].by("drake"), shard.grasps.q[0]).own()
+    model.mujoco.body_inertia[model.object_body] = [1.0, 1.0, 3.0]  # of no body: the third is more than both
+    with pytest.raises(PhysicsError, match=r"^Drake refuses the hand or an object: .{10,300}$"):
+        make_world(model)
 
 
 @pytest.mark.parametrize("name", ["barrett", "schunk_svh"])
