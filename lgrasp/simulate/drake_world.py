@@ -7,7 +7,7 @@ import numpy as np
 from lgrasp.errors import PhysicsError, short_reason
 from lgrasp.runtime.optional import import_mujoco, import_optional
 from lgrasp.simulate.model import Model, effort_limit, leaders, pairs_apart
-from lgrasp.simulate.verdict import WILD, links_touching, touches_table
+from lgrasp.simulate.verdict import WILD
 from lgrasp.simulate.world import World
 
 MODULUS = 1.0e7
@@ -53,8 +53,9 @@ class DrakeWorld(World):
     """
 
     def __init__(self, model: Model) -> None:
+        super().__init__(model)
         self._drake, self._mujoco = import_drake(), import_mujoco()
-        self._model, self._m = model, model.mujoco
+        self._m = model.mujoco
         if not model.protocol.draws:
             self._make()
 
@@ -135,12 +136,6 @@ class DrakeWorld(World):
         poses = [self._plant.EvalBodyPoseInWorld(self._context, body) for body in self._bodies]
         return np.array([p.translation() for p in poses]), np.array([p.rotation().matrix() for p in poses])
 
-    def links_touching(self) -> np.ndarray:
-        return links_touching(self._touching(), self._model.object_body, self._m.nbody)
-
-    def on_table(self) -> bool:
-        return touches_table(self._touching(), self._model.table.body, self._model.object_body)
-
     def deepest(self) -> float:
         own = set(self._model.object_body.tolist())
         query = self._plant.get_geometry_query_input_port().Eval(self._context)
@@ -150,8 +145,7 @@ class DrakeWorld(World):
     def wild(self) -> bool:
         return not np.abs(self._plant.GetVelocities(self._context)).max() < WILD
 
-    def _touching(self) -> np.ndarray:
-        """Both bodies of each contact, (n, 2)."""
+    def touching(self) -> np.ndarray:
         found = self._plant.get_contact_results_output_port().Eval(self._context)
         surfaces = [
             found.hydroelastic_contact_info(k).contact_surface() for k in range(found.num_hydroelastic_contacts())

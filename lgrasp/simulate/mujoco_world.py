@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from lgrasp.simulate.model import Model
-from lgrasp.simulate.verdict import WILD, links_touching, touches_table
+from lgrasp.simulate.verdict import WILD
 from lgrasp.simulate.world import World
 
 
@@ -20,8 +20,9 @@ class MujocoWorld(World):
     def __init__(self, model: Model, *, near: bool = False) -> None:
         import mujoco
 
+        super().__init__(model)
         self._lib: Any = mujoco
-        self._model, self._m = model, model.mujoco_near if near else model.mujoco
+        self._m = model.mujoco_near if near else model.mujoco
         self.data = mujoco.MjData(self._m)
         self._of_object = np.isin(self._m.geom_bodyid, model.object_body)
 
@@ -81,13 +82,8 @@ class MujocoWorld(World):
         self._lib.mj_kinematics(self._m, self.data)
         return self.data.xpos, self.data.xmat.reshape(-1, 3, 3)
 
-    def links_touching(self) -> np.ndarray:
-        bodies = self._m.geom_bodyid[self.data.contact.geom]
-        return links_touching(bodies, self._model.object_body, self._m.nbody)
-
-    def on_table(self) -> bool:
-        bodies = self._m.geom_bodyid[self.data.contact.geom[self.data.contact.dist < 0]]
-        return touches_table(bodies, self._model.table.body, self._model.object_body)
+    def touching(self) -> np.ndarray:
+        return self._m.geom_bodyid[self.data.contact.geom]
 
     def deepest(self, *, of_links: bool = False) -> float:
         """Deepest penetration of any object, in a link or in another object; of links in links too if asked [m]."""

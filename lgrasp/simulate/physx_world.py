@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from lgrasp.errors import PhysicsError
 from lgrasp.runtime.optional import import_mujoco, import_optional
 from lgrasp.simulate.model import Model, effort_limit, leaders, pairs_apart
-from lgrasp.simulate.verdict import WILD, links_touching, touches_table
+from lgrasp.simulate.verdict import WILD
 from lgrasp.simulate.world import World
 
 CONTACT_OFFSET = 0.002
@@ -83,10 +83,11 @@ class PhysxWorld(World):
     """
 
     def __init__(self, model: Model) -> None:
+        super().__init__(model)
         self._sapien = import_physx()
         self._px = self._sapien.physx
         self._mujoco = import_mujoco()
-        self._model, self._m = model, model.mujoco
+        self._m = model.mujoco
         self._ignored = self._ignore_groups()
         self._past: list[tuple[Callable[..., None], tuple[Any, ...]]] = []
 
@@ -189,12 +190,6 @@ class PhysxWorld(World):
             at[body], turn[body] = pose.p, Rotation.from_quat(pose.q, scalar_first=True).as_matrix()
         return at, turn
 
-    def links_touching(self) -> np.ndarray:
-        return links_touching(self._touching(), self._model.object_body, self._m.nbody)
-
-    def on_table(self) -> bool:
-        return touches_table(self._touching(), self._model.table.body, self._model.object_body)
-
     def deepest(self) -> float:
         own = set(self._model.object_body.tolist())
         return max([0.0, *(-apart for pair, apart in self._contacts() if own & {*pair})])
@@ -208,8 +203,7 @@ class PhysxWorld(World):
         contacts = [contact for contact in self._system.get_contacts() if contact.points]
         return [([self._number[body] for body in c.bodies], min(p.separation for p in c.points)) for c in contacts]
 
-    def _touching(self) -> np.ndarray:
-        """Both bodies of each contact that presses, (n, 2)."""
+    def touching(self) -> np.ndarray:
         return np.array([pair for pair, apart in self._contacts() if apart < 0.0], int).reshape(-1, 2)
 
     def _make(self) -> None:

@@ -201,28 +201,6 @@ def at_rest(velocity: np.ndarray) -> np.ndarray:
     return (speed < _REST).all((-2, -1))
 
 
-def links_touching(bodies: np.ndarray, objects: np.ndarray, count: int) -> np.ndarray:
-    """Number of the hand's bodies in contact with each object (O,).
-
-    Args:
-        bodies: both bodies of each contact (n, 2).
-        objects: bodies of the objects (O,); all others are the hand's.
-        count: bodies in all.
-    """
-    hand = np.ones(count, bool)
-    hand[objects] = False
-    found = np.zeros(len(objects), int)
-    for number, body in enumerate(objects):
-        others = np.unique(bodies[(bodies == body).any(1)].sum(1) - body)
-        found[number] = hand[others].sum()
-    return found
-
-
-def touches_table(bodies: np.ndarray, table: int, objects: np.ndarray) -> bool:
-    """Whether an object touches the table; arguments as of :func:`links_touching`."""
-    return bool(((bodies == table).any(1) & np.isin(bodies, objects).any(1)).any())
-
-
 COLUMNS: dict[str, str] = {
     "holds": "bool [N]: success in all six directions",
     "directions": "int8 [N, 6]: +x -x +y -y +z -z of the hand base frame; 1 held, 0 lost, -1 not run",
