@@ -63,7 +63,7 @@ class DrakeWorld(World):
         if self._model.protocol.draws:  # the model's numbers are others each time
             self._make()
         model, tree = self._model, self._drake.multibody.tree
-        self._time = 0
+        self._time, self._gave_up = 0, False
         self._root.SetTime(0.0)
         self._plant.SetVelocities(self._context, np.zeros(self._plant.num_velocities()))
         for joint, value in zip(self._joints.values(), model.joint_matrix @ q + model.joint_offset, strict=True):
@@ -77,6 +77,7 @@ class DrakeWorld(World):
         self._simulator.Initialize()
 
     def drive(self, targets: np.ndarray) -> None:
+        self._targets = targets
         positions = np.where(self._actuators >= 0, targets[self._actuators], 0.0)
         self._wanted.FixValue(self._context, np.concatenate([positions, np.zeros_like(positions)]))
 
@@ -86,7 +87,7 @@ class DrakeWorld(World):
 
     def press(self, loads: dict[int, tuple[np.ndarray, np.ndarray]]) -> None:
         """Forces (3,) [N] on the centres of mass of bodies, and torques (3,) [N m], from now on, world frame."""
-        pulls = []
+        self._loads, pulls = loads, []
         for number, (force, torque) in loads.items():
             pull = self._drake.multibody.plant.ExternallyAppliedSpatialForce()
             pull.body_index, pull.p_BoBq_B = self._bodies[number].index(), self._m.body_ipos[number]
@@ -110,14 +111,19 @@ class DrakeWorld(World):
 
     def step(self, steps: int) -> None:
         self._time += steps
-        self._simulator.AdvanceTo(self._time * self._m.opt.timestep)
+        try:
+            self._simulator.AdvanceTo(self._time * self._m.opt.timestep)
+        except RuntimeError:  # the contact solver found no solution
+            self._gave_up = True
 
     def state(self) -> Any:
-        return self._time, self._root.Clone()
+        return self._time, self._gave_up, self._root.Clone(), self._targets, self._loads
 
     def restore(self, state: Any) -> None:
-        self._time, before = state
+        self._time, self._gave_up, before, targets, loads = state
         self._root.SetTimeStateAndParametersFrom(before)
+        self.drive(targets)
+        self.press(loads)
         self._simulator.Initialize()
 
     def objects(self) -> np.ndarray:
@@ -143,7 +149,7 @@ class DrakeWorld(World):
         return max([0.0, *(pair.depth for pair in pairs if own & {self._number[pair.id_A], self._number[pair.id_B]})])
 
     def wild(self) -> bool:
-        return not np.abs(self._plant.GetVelocities(self._context)).max() < WILD
+        return self._gave_up or not np.abs(self._plant.GetVelocities(self._context)).max() < WILD
 
     def touching(self) -> np.ndarray:
         found = self._plant.get_contact_results_output_port().Eval(self._context)

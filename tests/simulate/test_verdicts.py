@@ -135,9 +135,9 @@ def test_weight_of_an_object(jaws: Jaws):
         assert judge(jaws.shard(press(normal)), protocol)["holds"] == [holds]
 
 
-def test_divergence_is_a_failure_and_writes_nothing(jaws: Jaws, tmp_path, monkeypatch):
+def test_divergence_is_a_failure_and_writes_nothing(jaws: Jaws, fc, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    found = judge(jaws.shard(press(4.0)), FC.model_copy(update={"force": 1.0e12}))
+    found = judge(jaws.shard(press(4.0)), fc.model_copy(update={"force": 1.0e12}))
     assert found["diverged"].all()
     assert not found["holds"].any()
     assert not list(tmp_path.iterdir())

@@ -64,6 +64,7 @@ def test_what_was_tried_leaves_no_trace(jaws, other: str):
     def poses(tries: int) -> np.ndarray:
         world.begin(rows.q_pregrasp[0], tilted)
         world.drive(model.controls(rows.q_squeeze[0].astype(float)))
+        world.push(np.array([[0.0, 0.5, 0.0]]))
         world.step(150)
         before = world.state()
         for number in range(tries):
@@ -71,11 +72,22 @@ def test_what_was_tried_leaves_no_trace(jaws, other: str):
             world.step(30)
             world.restore(before)
         assert world.links_touching() == 2
-        world.push(np.array([[0.0, 0.5, 0.0]]))
         world.step(50)
         return np.concatenate([world.objects().ravel(), world.hand_joints()])
 
     np.testing.assert_array_equal(poses(2), poses(0))
+
+
+def test_a_world_that_ran_away_begins_again(jaws, engine: str, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log there
+    shard = jaws.shard()
+    rows, scene = shard.grasps, Scene(hand_of_record(shard.hand, no_cut), (object_of_record(shard.objects[0]),))
+    world = make_world(build_model(scene, PROTOCOLS["fc"].by(engine), rows.q[0]))
+    for force, wild in ((0.0, False), (np.nan, True), (0.0, False)):
+        world.begin(rows.q_pregrasp[0], rows.object_pose[0])
+        world.push(np.array([[force, 0.0, 0.0]]))
+        world.step(10)
+        assert world.wild() == wild
 
 
 def test_what_drake_refuses_is_one_line(jaws):
