@@ -81,12 +81,7 @@ class DrakeWorld(World):
         positions = np.where(self._actuators >= 0, targets[self._actuators], 0.0)
         self._wanted.FixValue(self._context, np.concatenate([positions, np.zeros_like(positions)]))
 
-    def push(self, forces: np.ndarray) -> None:
-        numbers = self._model.object_body
-        self.press({int(b): (f, np.zeros(3)) for b, f in zip(numbers, forces, strict=True)})
-
     def press(self, loads: dict[int, tuple[np.ndarray, np.ndarray]]) -> None:
-        """Forces (3,) [N] on the centres of mass of bodies, and torques (3,) [N m], from now on, world frame."""
         self._loads, pulls = loads, []
         for number, (force, torque) in loads.items():
             pull = self._drake.multibody.plant.ExternallyAppliedSpatialForce()

@@ -45,8 +45,10 @@ class MujocoWorld(World):
     def drive(self, targets: np.ndarray) -> None:
         self.data.ctrl[:] = targets
 
-    def push(self, forces: np.ndarray) -> None:
-        self.data.xfrc_applied[self._model.object_body, :3] = forces
+    def press(self, loads: dict[int, tuple[np.ndarray, np.ndarray]]) -> None:
+        self.data.xfrc_applied[:] = 0.0
+        for body, load in loads.items():
+            self.data.xfrc_applied[body] = np.concatenate(load)
 
     def place_table(self, pose: np.ndarray) -> None:
         self.data.qpos[self._model.table.address] = self._table = np.array(pose, float)

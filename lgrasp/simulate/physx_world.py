@@ -119,13 +119,8 @@ class PhysxWorld(World):
                 joint.set_drive_target(float(target))
 
     @_recorded
-    def push(self, forces: np.ndarray) -> None:
-        self._forces[:] = forces
-
     def press(self, loads: dict[int, tuple[np.ndarray, np.ndarray]]) -> None:
-        """Forces (3,) [N] on the centres of mass of links, and torques (3,) [N m], in the next step, world frame."""
-        for body, (force, torque) in loads.items():
-            self._links[body].add_force_torque(force, torque)
+        self._loads = loads
 
     @_recorded
     def place_table(self, pose: np.ndarray) -> None:
@@ -140,8 +135,8 @@ class PhysxWorld(World):
     @_recorded
     def step(self, steps: int) -> None:
         for _ in range(steps):
-            for component, force in zip(self._objects, self._forces, strict=True):
-                component.add_force_torque(force, np.zeros(3))
+            for body, load in self._loads.items():
+                self._component[body].add_force_torque(*load)
             if self._coupled:
                 self._tie()
             self._system.step()
@@ -227,8 +222,8 @@ class PhysxWorld(World):
         self._objects: list[Any] = []
         self._links: dict[int, Any] = {}
         self._build()
-        self._number = {component: body for body, component in self._links.items()}
-        self._number |= {c: int(b) for b, c in zip(model.object_body, self._objects, strict=True)}
+        self._component = self._links | dict(zip(model.object_body.tolist(), self._objects, strict=True))
+        self._number = {component: body for body, component in self._component.items()}
         if model.table.body >= 0:
             self._number[self._table] = model.table.body
         self._hand = self._links[0].articulation
@@ -241,7 +236,7 @@ class PhysxWorld(World):
         self._coupled: list[_Coupled] = []
         self._before: np.ndarray | None = None  # positions of the joints a step ago
         self._couple(row)
-        self._forces = np.zeros((len(self._objects), 3), np.float32)
+        self._loads: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def _ignore_groups(self) -> np.ndarray:
         """A bit for each pair of bodies that must not collide (B,), but for neighbours, which PhysX leaves out."""

@@ -28,9 +28,15 @@ class World(ABC):
     def drive(self, targets: np.ndarray) -> None:
         """Set the targets of the drives (nu,) [rad or m]."""
 
-    @abstractmethod
     def push(self, forces: np.ndarray) -> None:
         """Pull on the objects' centres of mass from now on (O, 3) [N], world frame."""
+        still = np.zeros(3)
+        self.press({int(body): (force, still) for body, force in zip(self._model.object_body, forces, strict=True)})
+
+    @abstractmethod
+    def press(self, loads: dict[int, tuple[np.ndarray, np.ndarray]]) -> None:
+        """Forces (3,) [N] on the centres of mass of bodies, and torques (3,) [N m], from now on, world frame; nothing
+        on others."""
 
     @abstractmethod
     def place_table(self, pose: np.ndarray) -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from support.jaws import mesh_record, shipped_hand
+from support.simulators import need
 from support.solids import no_cut
 
 from lgrasp.errors import PhysicsError
@@ -91,7 +92,7 @@ def test_a_world_that_ran_away_begins_again(jaws, engine: str, tmp_path, monkeyp
 
 
 def test_what_drake_refuses_is_one_line(jaws):
-    pytest.importorskip("pydrake", reason="drake is not installed (extra drake)")
+    need("drake")
     shard = jaws.shard()
     scene = Scene(hand_of_record(shard.hand, no_cut), (object_of_record(shard.objects[0]),))
     model = build_model(scene, PROTOCOLS["fc"].by("drake"), shard.grasps.q[0]).own()
@@ -117,11 +118,9 @@ def test_joints_of_one_drive_give_way_together(name: str, other: str):
     joints = m.jnt_dofadr[[j for j in range(m.njnt) if m.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]]
     M = model.joint_matrix
     wanted = M @ (M.T @ turning[joints]) / model.protocol.stiffness
-    data.xfrc_applied[hand, 3:] = torque
-    mujoco_world.step(300)
-    for _ in range(300):
-        other_world.press({body: (np.zeros(3), torque) for body in hand})
-        other_world.step(1)
+    for world in (mujoco_world, other_world):
+        world.press({body: (np.zeros(3), torque) for body in hand})
+        world.step(300)
     moved, moved_other = mujoco_world.hand_joints() - rest, other_world.hand_joints() - rest
     most = np.abs(wanted).max()
     assert most > 0.01
