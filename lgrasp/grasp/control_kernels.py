@@ -224,11 +224,18 @@ def press_shared(
                 k = wp.where(hand.kin.joint_parent[k] < 0, -1, hand.kin.joint_parent[k] + hand.kin.joint_first[g])
 
 
+@wp.func
+def _column_stiffness(hand: Hand, limits: Limits, column: wp.int32):
+    """Of the position control of a column of q [N m/rad or N/m]."""
+    arm = wp.where(hand.kin.column_sliding[column] == 1, SLIDING_ARM, 1.0)
+    return limits.squeeze_stiffness / (arm * arm)
+
+
 @wp.kernel
 def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), packed_out: Packed):
     """Targets of the squeeze within joint limits; where its force would be nearer to the stable one than
-    ``squeeze_margin``, all forces of the hand shrink alike. And how far that takes the contacts, mean by force, if the
-    object gives way.
+    ``squeeze_margin``, or a joint would exceed its effort limit, all forces of the hand shrink alike. And how far that
+    takes the contacts, mean by force, if the object gives way.
 
     Args:
         row: (m,) hand of each row, -1 none.
@@ -238,13 +245,16 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
         return
     most = limits.squeeze_margin * limits.squeeze_force
     share = wp.where(most > packed_out.stable_squeeze[i], packed_out.stable_squeeze[i] / most, 1.0)
+    for c in range(packed_out.q.shape[1]):
+        effort = wp.abs(packed_out.q_squeeze[i, c] - packed_out.q[i, c]) * _column_stiffness(hand, limits, c)
+        if share * effort > hand.kin.column_effort[c]:
+            share = hand.kin.column_effort[c] / effort
     work = float(0.0)
     for c in range(packed_out.q.shape[1]):
         q = packed_out.q[i, c]
         wanted = q + (packed_out.q_squeeze[i, c] - q) * share
         target = wp.clamp(wanted, hand.kin.column_lower[c], hand.kin.column_upper[c])
-        arm = wp.where(hand.kin.column_sliding[c] == 1, SLIDING_ARM, 1.0)
-        work += limits.squeeze_stiffness * (wanted - q) * (target - q) / (arm * arm)
+        work += _column_stiffness(hand, limits, c) * (wanted - q) * (target - q)
         packed_out.q_squeeze[i, c] = target
     packed_out.squeeze_travel[i] = work / wp.max(share * limits.squeeze_force, _LEAST_FORCE)
 

@@ -110,6 +110,7 @@ def upload_hand(model: HandModel, device: str, thumb: ThumbBend | None = None) -
         "dof_upper": t.joint_upper[t.dof_index],
         "column_lower": t.joint_lower,
         "column_upper": t.joint_upper,
+        "column_effort": t.joint_effort,
         "shared": len(t.shared_names),
         "settings": len(t.settings),
         "dof_setting": np.tile(t.settings[:, t.dof_index], (model.surfaces, 1)),

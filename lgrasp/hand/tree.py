@@ -30,6 +30,7 @@ class Tree:
     joint_names: tuple[str, ...]  # K actuated joints in the order of q
     joint_lower: np.ndarray  # (K,) [rad or m]
     joint_upper: np.ndarray  # (K,)
+    joint_effort: np.ndarray  # (K,) what each presses with at most [N m or N]; infinite: no limit
     joint_open: np.ndarray  # (K,) the open posture
     joint_first: np.ndarray  # (G + 1,) i32
     dof_first: np.ndarray  # (G + 1,) i32
@@ -220,6 +221,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         joint_names=tuple(j.name for j in actuated),
         joint_lower=lower.astype(np.float32),
         joint_upper=upper.astype(np.float32),
+        joint_effort=np.array([j.effort for j in actuated], np.float32),
         joint_open=settings[0],
         joint_first=np.cumsum([0, *(len(m) for m in groups)]).astype(np.int32),
         dof_first=np.array(dof_first, np.int32),

@@ -45,6 +45,7 @@ class Joint:
     lower: float
     upper: float
     mimic: tuple[str, float, float] | None  # source joint, multiplier, offset
+    effort: float  # what its drive presses with at most [N m or N]
 
     def motion(self, x: np.ndarray) -> np.ndarray:
         """Transforms [..., 4, 4] of the moving frame at positions x [rad or m], shape [...]."""
@@ -325,7 +326,7 @@ def _joint(path: Path, element: etree._Element, links: dict[str, tuple[Geometry,
     movable = kind in MOVABLE
     if not movable and kind != "fixed":
         raise HandError(f"URDF {path}: {where} is {kind}; accepted: fixed, revolute, continuous, prismatic")
-    axis, (lower, upper), mimic = np.array([1.0, 0.0, 0.0]), (0.0, 0.0), None
+    axis, (lower, upper), mimic, effort = np.array([1.0, 0.0, 0.0]), (0.0, 0.0), None, math.inf
     if (turning := element.find("axis")) is not None:
         axis = _numbers(path, where, turning, "xyz", "1 0 0")
     if movable:
@@ -334,11 +335,12 @@ def _joint(path: Path, element: etree._Element, links: dict[str, tuple[Geometry,
             raise HandError(f"URDF {path}: {where} has axis {axis.tolist()}; three numbers, not all 0, are needed")
         axis = axis / length
         lower, upper = (-math.pi, math.pi) if kind == "continuous" else _bounds(path, where, element)
+        effort = _effort(path, where, element)
         if (source := element.find("mimic")) is not None:
             factor, offset = (_number(path, where, source, *x) for x in (("multiplier", "1"), ("offset", "0")))
             mimic = (source.get("joint", ""), factor, offset)
     origin = _origin(path, where, element)
-    return Joint(name, parent, child, origin, movable, kind == "prismatic", axis, lower, upper, mimic)
+    return Joint(name, parent, child, origin, movable, kind == "prismatic", axis, lower, upper, mimic, effort)
 
 
 def _bounds(path: Path, where: str, joint: etree._Element) -> tuple[float, float]:
@@ -350,6 +352,13 @@ def _bounds(path: Path, where: str, joint: etree._Element) -> tuple[float, float
     if not (math.isfinite(lower) and math.isfinite(upper) and lower < upper):
         raise HandError(f"URDF {path}: {where} has limits [{lower}, {upper}]; lower must be below upper")
     return lower, upper
+
+
+def _effort(path: Path, where: str, joint: etree._Element) -> float:
+    """Effort limit of a joint [N m or N]; infinite where none above 0 is given."""
+    limit = joint.find("limit")
+    effort = 0.0 if limit is None else _number(path, where, limit, "effort", "0")
+    return effort if effort > 0 else math.inf
 
 
 def _order(path: Path, links: dict[str, tuple[Geometry, ...]], joints: list[Joint]) -> tuple[list[Joint], str]:

@@ -2,13 +2,13 @@
 
 Over the motion dq of the joints and dx of the object (shift of its centre of mass, then turn), base frame,
 
-    E = sum_j k_j/2 (q + dq - target)^2 + c_j/2 dq^2  +  M/2 |dx - dx_free|^2 - F dx
+    E = sum_j huber(q + dq - target; k_j, tau_j) + c_j/2 dq^2  +  M/2 |dx - dx_free|^2 - F dx
       + sum_c kappa/2 min(gap + n y, 0)^2 + huber(|slip + y_t|; kappa, mu f_c)
 
-with y = J dq - (dx moved to the contact): drives and their damping, the object's inertia over the squared time step and
-its load, contacts that are springs when they close, and friction: a spring that slips at its bound, the coefficient
-times the normal force f_c, which is the mean of the points where a link touches: such a patch is soft and touches
-between them too. E is convex as long as f_c is held.
+with y = J dq - (dx moved to the contact): drives, springs that give way at their effort limit tau_j, and their damping,
+the object's inertia over the squared time step and its load, contacts that are springs when they close, and friction: a
+spring that slips at its bound, the coefficient times the normal force f_c, which is the mean of the points where a link
+touches: such a patch is soft and touches between them too. E is convex as long as f_c is held.
 """
 
 import warp as wp
@@ -123,6 +123,14 @@ def contact_slope(m: Material, contact: Contact, y: wp.vec4, z: wp.vec4):
 
 
 @wp.func
-def beyond_limits(hand: Hand, k: wp.int32, x: wp.float32):
-    """How far position x of dof k is beyond its limits [rad or m]."""
-    return wp.max(x - hand.kin.dof_upper[k], 0.0) + wp.min(x - hand.kin.dof_lower[k], 0.0)
+def drive_effort(m: Material, k: wp.int32, dq: wp.float32, w: Scratch):
+    """What the drive of dof k resists its motion dq with [N m or N]: a spring up to its effort limit."""
+    return wp.clamp(m.drive * w.scale[k] * (w.q[k] + dq - w.target[k]), -w.effort[k], w.effort[k])
+
+
+@wp.func
+def stop_effort(hand: Hand, m: Material, k: wp.int32, dq: wp.float32, w: Scratch):
+    """What the stops of dof k resist its motion dq with [N m or N]: 0 within its limits."""
+    x = w.q[k] + dq
+    over = wp.max(x - hand.kin.dof_upper[k], 0.0) + wp.min(x - hand.kin.dof_lower[k], 0.0)
+    return LIMIT * m.drive * w.scale[k] * over

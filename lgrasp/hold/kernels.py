@@ -197,8 +197,8 @@ def _place(hand: Hand, w: Scratch):
 
 @wp.func
 def _describe(hand: Hand, w: Scratch):
-    """Write the group of each dof, and its stiffness over that of a revolute joint; copies of a shared joint have it
-    together."""
+    """Write the group of each dof, its stiffness over that of a revolute joint and its effort limit; copies of a shared
+    joint have these together."""
     dofs = hand.kin.dof_first[hand.kin.groups]
     for k in range(w.lane, dofs, w.lanes):
         g = int(0)
@@ -214,6 +214,7 @@ def _describe(hand: Hand, w: Scratch):
             if hand.kin.dof_index[o] == hand.kin.dof_index[k]:
                 copies += 1.0
         w.scale[k] = stiff / copies
+        w.effort[k] = hand.kin.column_effort[hand.kin.dof_index[k]] / copies
 
 
 @wp.func

@@ -67,6 +67,7 @@ class Scratch:
     dq: wp.array(dtype=wp.float32)  # (MAX_HAND_DOFS,) motion in this step
     target: wp.array(dtype=wp.float32)  # (MAX_HAND_DOFS,)
     scale: wp.array(dtype=wp.float32)  # (MAX_HAND_DOFS,) of stiffness, 1 for revolute joints
+    effort: wp.array(dtype=wp.float32)  # (MAX_HAND_DOFS,) limit of what the drive presses with [N m or N]
     group: wp.array(dtype=wp.int32)  # (MAX_HAND_DOFS,) of each dof
     step: wp.array(dtype=wp.float32)  # (rows,) gradient, then step of an iteration
     A: wp.array(dtype=wp.float32)  # (rows * MAX_DOFS,) see lgrasp.hold.system
@@ -82,7 +83,7 @@ Scratches, scratch_of = rows_of(Scratch)
 _SIZES = {
     **dict.fromkeys(("contacts", "before", "Y", "Z", "press", "terms"), MAX_TOUCHES),
     **dict.fromkeys(("column", "spin"), MAX_TOUCHES * MAX_DOFS),
-    **dict.fromkeys(("q", "dq", "target", "scale", "group"), MAX_HAND_DOFS),
+    **dict.fromkeys(("q", "dq", "target", "scale", "effort", "group"), MAX_HAND_DOFS),
     "made": MAX_TAGS,
     **dict.fromkeys(("object_rows", "object_slope"), MAX_TOUCHES * 6),
     "X": MAX_BODIES,

@@ -7,9 +7,10 @@ from lgrasp.hold.energy import (
     LIMIT,
     Body,
     Material,
-    beyond_limits,
     contact_slope,
+    drive_effort,
     relative_motion,
+    stop_effort,
     twist_stiffness,
 )
 from lgrasp.hold.scratch import Scratch
@@ -60,11 +61,14 @@ def _assemble(hand: Hand, m: Material, body: Body, count: wp.int32, dx: wp.spati
         group = w.group[k]
         drag = m.drag * w.scale[k]
         stiff = m.drive * w.scale[k]
-        over = beyond_limits(hand, k, w.q[k] + w.dq[k])
-        slope = stiff * (w.q[k] + w.dq[k] - w.target[k] + LIMIT * over) + drag * w.dq[k]
-        if over != 0.0:
-            stiff += LIMIT * stiff
-        set_row(hand, count, group, k - hand.kin.dof_first[group], stiff + drag, slope, w)
+        effort = drive_effort(m, k, w.dq[k], w)
+        stop = stop_effort(hand, m, k, w.dq[k], w)
+        curvature = drag
+        if wp.abs(effort) < w.effort[k]:
+            curvature += stiff
+        if stop != 0.0:
+            curvature += LIMIT * stiff
+        set_row(hand, count, group, k - hand.kin.dof_first[group], curvature, effort + stop + drag * w.dq[k], w)
     for k in range(end + w.lane, end + hand.kin.shared, w.lanes):
         clear_row(k, w)
     for a in range(w.lane, 6, w.lanes):
@@ -137,10 +141,9 @@ def _share_of_step(
         rise = wp.dot(by_turn, turn) + body.mass * wp.dot(wp.spatial_top(move), wp.spatial_top(move))
     dofs = hand.kin.dof_first[hand.kin.groups]
     for k in range(w.lane, dofs, w.lanes):
-        stiff = m.drive * w.scale[k]
         drag = m.drag * w.scale[k]
-        first += w.step[k] * (stiff * (w.q[k] + w.dq[k] - w.target[k]) + drag * w.dq[k])
-        rise += w.step[k] * w.step[k] * (stiff + drag)
+        first += w.step[k] * drag * w.dq[k]
+        rise += w.step[k] * w.step[k] * drag
     low = float(0.0)
     high = float(1.0)
     slope_low = slope
@@ -151,8 +154,8 @@ def _share_of_step(
         for c in range(w.lane, count, w.lanes):
             here += contact_slope(m, w.contacts[c], w.Y[c] + w.Z[c] * share, w.Z[c])
         for k in range(w.lane, dofs, w.lanes):
-            over = beyond_limits(hand, k, w.q[k] + w.dq[k] + share * w.step[k])
-            here += LIMIT * m.drive * w.scale[k] * over * w.step[k]
+            there = w.dq[k] + share * w.step[k]
+            here += w.step[k] * (drive_effort(m, k, there, w) + stop_effort(hand, m, k, there, w))
         here = lanes_sum(here)
         if (attempt == 0 and here <= 0.0) or wp.abs(here) < -0.1 * slope:
             break

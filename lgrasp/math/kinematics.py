@@ -35,6 +35,7 @@ class Kinematics:
     dof_index: wp.array(dtype=wp.int32)  # (D,) column of q that a group's dof is
     column_lower: wp.array(dtype=wp.float32)  # (K,) limits of the columns of q [rad or m]
     column_upper: wp.array(dtype=wp.float32)  # (K,)
+    column_effort: wp.array(dtype=wp.float32)  # (K,) effort limits [N m or N], infinite: none
     column_sliding: wp.array(dtype=wp.int32)  # (K,) 1: the joint slides
     dof_free: wp.array(dtype=wp.int32)  # (groups,) dofs that the group moves itself; shared ones come after
     dof_shared: wp.array(dtype=wp.int32)  # (D,) which of the shared joints a dof is, -1 for a group's own

@@ -59,6 +59,8 @@ class _Coupled(NamedTuple):
     """(2, J) stiffness and damping with which each is held to all of them."""
     own: np.ndarray
     """(2, J) likewise with which each takes its part in the drive."""
+    limit: float
+    """Effort limit of the drive [N m or N]."""
 
 
 def _recorded(act: Callable[..., None]) -> Callable[..., None]:
@@ -153,10 +155,18 @@ class PhysxWorld(World):
             rate = _AHEAD * (f * d * speed[c.joints]).sum() / (f * f * d).sum()
             mean = (f * k * (q[c.joints] - c.offset)).sum() / (f * f * k).sum()
             ahead = mean + 0.5 * rate * self._m.opt.timestep
-            targets = f * (k * ahead + k_own * self._targets[c.drive]) / (k + k_own) + c.offset
+            targets = f * (k * ahead + k_own * self._within_effort(c, ahead, rate)) / (k + k_own) + c.offset
             for place, target, velocity in zip(c.joints, targets, f * rate * d / (d + d_own), strict=True):
                 self._joints[place].set_drive_target(float(target))
                 self._joints[place].set_drive_velocity_target(float(velocity))
+
+    def _within_effort(self, c: _Coupled, at: float, rate: float) -> float:
+        """The target of a drive, or the one at which it presses with its effort limit, at a position and speed."""
+        target, (gain, damping) = float(self._targets[c.drive]), self._gains(c.drive)
+        effort = gain * (target - at) - damping * rate
+        if abs(effort) <= c.limit:
+            return target
+        return at + (np.copysign(c.limit, effort) + damping * rate) / gain
 
     def state(self) -> Any:
         """All that was done since :meth:`begin`, which decides what comes next."""
@@ -349,7 +359,9 @@ class PhysxWorld(World):
             places = np.array([self._column[row[int(joint)]] for joint in joints])
             for place, (k, d) in zip(places, (tie + own).T, strict=True):
                 self._joints[place].set_drive_property(float(k), float(d))
-            self._coupled.append(_Coupled(driven[leader], places, multiplier, offset, tie, own))
+            self._coupled.append(
+                _Coupled(driven[leader], places, multiplier, offset, tie, own, effort_limit(m, leader))
+            )
 
     def _gains(self, drive: int) -> tuple[float, float]:
         return float(self._m.actuator_gainprm[drive, 0]), float(-self._m.actuator_biasprm[drive, 2])

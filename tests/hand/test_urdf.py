@@ -76,6 +76,7 @@ BAD = {
     "limits equal": (robot(A, B, joint("j", "a", "b", limit='lower="1" upper="1"')), "lower must be below"),
     "limits not finite": (robot(A, B, joint("j", "a", "b", limit='lower="0" upper="inf"')), "lower must be below"),
     "limits not numbers": (robot(A, B, joint("j", "a", "b", limit='lower="0" upper="wide"')), "malformed"),
+    "effort not a number": (robot(A, B, joint("j", "a", "b", limit='lower="0" upper="1" effort="much"')), "malformed"),
     "zero axis": (robot(A, B, J.replace("0 0 1", "0 0 0")), "not all 0"),
     "axis not finite": (robot(A, B, J.replace("0 0 1", "0 0 nan")), "axis"),
     "short axis": (robot(A, B, J.replace("0 0 1", "0 1")), "malformed|axis"),
@@ -211,6 +212,7 @@ def test_good_urdf_reads_as_written(tmp_path):
     assert (urdf.joints[0].lower, urdf.joints[0].upper) == (-np.pi, np.pi)
     assert urdf.joints[1].prismatic
     assert (urdf.joints[1].lower, urdf.joints[1].upper) == (-0.1, 0.2)
+    assert [j.effort for j in urdf.joints] == [np.inf, 1]
 
 
 def test_undeclared_prefixes_of_other_tools_are_left_out(tmp_path):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from support.hands import with_efforts
 from support.holding import ARM, AXIS, CONTACT, HALF, RADIUS, STIFF, certain, press, solid
 
 from lgrasp.hold.params import HoldTest
@@ -27,6 +28,24 @@ def test_a_block_slips_at_mu_n_for_any_friction(two_fingers, box, force):
         for share in AROUND
     ]
     assert held == HOLDS
+
+
+@pytest.mark.parametrize("effort", [1.5, 5.0])
+def test_fingers_press_no_harder_than_their_effort(two_fingers, box, effort):
+    """Targets ask for more of each finger than its effort limit [N], which decides, as N above."""
+    weak = with_efforts(two_fingers, effort)
+    held = [
+        HoldTester(weak, box, certain(share / (2 * effort))).run(press([effort + 2.0]), 0)["hold_probability"][0]
+        for share in AROUND
+    ]
+    assert held == HOLDS
+
+
+def test_fingers_that_are_too_weak_give_way(two_fingers, box):
+    """Along the fingers one of them must bear the whole pull, however large friction is."""
+    for effort, holds in ((0.9, 0), (1.1, 1)):
+        found = HoldTester(with_efforts(two_fingers, effort), box, certain(2.0)).run(press([effort]), 0)
+        assert found["hold_probability"] == [holds]
 
 
 @pytest.mark.parametrize("force", [2.0, 10.0])

@@ -34,6 +34,7 @@ def step_once(
     given: wp.array(dtype=Contact),
     q: wp.array(dtype=wp.float32),
     target: wp.array(dtype=wp.float32),
+    effort: wp.array(dtype=wp.float32),
     scratch: Scratches,
     # out
     dx_out: wp.array(dtype=wp.spatial_vector),
@@ -48,6 +49,7 @@ def step_once(
             v[d] = q[first + d]
             w.q[first + d] = q[first + d]
             w.target[first + d] = target[first + d]
+            w.effort[first + d] = effort[first + d]
             w.group[first + d] = g
             w.scale[first + d] = wp.where(hand.kin.dof_shared[first + d] < 0, 1.0, 0.5)
         group_forward(hand.kin, g, v, w.X, hand.kin.joint_first[g])
@@ -67,6 +69,7 @@ class Problem:
     w: np.ndarray  # (C, K)
     q: np.ndarray
     target: np.ndarray
+    effort: np.ndarray
     com: np.ndarray
     mass: float
     inertia: np.ndarray
@@ -96,12 +99,13 @@ class Problem:
         dq, r = z[:-6], z[-6:] - self.free
         x = self.q + dq
         beyond = np.maximum(x - self.high, 0) + np.minimum(x - self.low, 0)
-        own = DRIVE / 2 * ((x - self.target) ** 2 + LIMIT * beyond**2) + DRAG / 2 * dq**2
+        own = DRIVE / 2 * LIMIT * beyond**2 + DRAG / 2 * dq**2
         load = self.mass / 2 * r[:3] @ r[:3] + r[3:] @ self.inertia @ r[3:] / 2 - self.force @ z[-6:-3]
         y, turn = self.motion(z)
         yn = (y * self.contacts["normal"]).sum(1)
         slip = np.linalg.norm(y - yn[:, None] * self.contacts["normal"] + self.contacts["slip"], axis=1)
-        total = own.sum() + load + STIFF / 2 * (np.minimum(self.contacts["gap"] + yn, 0) ** 2).sum()
+        drives = huber(np.abs(x - self.target), DRIVE, self.effort)
+        total = own.sum() + drives + load + STIFF / 2 * (np.minimum(self.contacts["gap"] + yn, 0) ** 2).sum()
         total += huber(slip, STIFF, self.friction * held)
         if self.torsion:
             total += huber(np.abs(turn + self.contacts["twist"]), STIFF * PATCH**2, self.torsion * held)
@@ -143,8 +147,12 @@ def spins(hand: HandArrays, q: np.ndarray, body: np.ndarray, normal: np.ndarray)
     return np.einsum("kca,ca->ck", turn, normal)
 
 
-def problem(hand: HandArrays, seed: int, *, friction: float, torsion: float) -> Problem:
-    """Fingers that press on an object which a force pulls; the base is in contact too, and a joint beyond its limit."""
+def problem(hand: HandArrays, seed: int, *, friction: float, torsion: float, effort: float = 100.0) -> Problem:
+    """Fingers that press on an object which a force pulls; the base is in contact too, and a joint beyond its limit.
+
+    Args:
+        effort: limit of joints [N m].
+    """
     rng = np.random.default_rng(seed)
     tree = hand.model.tree
     q = rng.uniform(0.1, 1.0, len(tree.joint_names))
@@ -175,6 +183,7 @@ def problem(hand: HandArrays, seed: int, *, friction: float, torsion: float) -> 
         w=spins(hand, q, body, normal),
         q=q,
         target=q + rng.uniform(-0.05, 0.05, len(q)),
+        effort=np.full(len(q), effort),
         com=com,
         mass=400.0,
         inertia=0.1 * (A @ A.T + np.eye(3)),
@@ -202,18 +211,21 @@ def solved(hand: HandArrays, p: Problem) -> tuple[np.ndarray, np.ndarray]:
             setattr(one, name, wp.vec3(*value) if np.ndim(value) else value.item())
         contacts.append(one)
     given = wp.array(contacts, dtype=Contact, device="cpu")
-    q, target = (wp.array(x[order].astype("f4"), device="cpu") for x in (p.q, p.target))
+    copies = np.bincount(order)  # of a joint, which have its effort together
+    q, target, effort = (wp.array(x[order].astype("f4"), device="cpu") for x in (p.q, p.target, p.effort / copies))
     dx, scratch = wp.zeros(1, dtype=wp.spatial_vector, device="cpu"), empty_scratches(1, "cpu")
-    wp.launch(step_once, 1, [hand.struct, m, body, given, q, target, scratch], [dx], device="cpu")
+    wp.launch(step_once, 1, [hand.struct, m, body, given, q, target, effort, scratch], [dx], device="cpu")
     z = np.concatenate([np.zeros(len(p.q)), dx.numpy()[0]])
     z[order] = scratch.dq.numpy()[0, : len(order)]
     return z, scratch.contacts.numpy()["force"][0, : len(contacts)]
 
 
+@pytest.mark.parametrize("effort", [100.0, 0.01])
 @pytest.mark.parametrize("seed", range(3))
-def test_without_friction_a_step_has_the_least_energy(hand, seed):
-    p = problem(hand, seed, friction=0.0, torsion=0.0)
+def test_without_friction_a_step_has_the_least_energy(hand, seed, effort):
+    p = problem(hand, seed, friction=0.0, torsion=0.0, effort=effort)
     found, force = solved(hand, p)
+    assert (DRIVE * np.abs(p.q + found[:-6] - p.target) > effort).any() == (effort < 1)
     reference = p.least(force)
     assert np.abs(reference).max() > 0.01
     np.testing.assert_allclose(found, reference, atol=3e-5)

@@ -66,7 +66,7 @@ def test_what_was_tried_leaves_no_trace(jaws, other: str):
         world.begin(rows.q_pregrasp[0], tilted)
         world.drive(model.controls(rows.q_squeeze[0].astype(float)))
         world.push(np.array([[0.0, 0.5, 0.0]]))
-        world.step(150)
+        world.step(300)
         before = world.state()
         for number in range(tries):
             world.push(np.full((1, 3), 1.0 + number))
@@ -126,3 +126,31 @@ def test_joints_of_one_drive_give_way_together(name: str, other: str):
     assert most > 0.01
     np.testing.assert_allclose(moved, wanted, atol=0.03 * most)
     np.testing.assert_allclose(moved_other, wanted, rtol=0.2, atol=0.1 * most)
+
+
+@pytest.mark.parametrize("share", [0.85, 1.15])
+def test_joints_of_one_drive_press_no_harder_than_its_effort(engine: str, share: float):
+    """A torque on the outer link of a finger turns both of its joints away unless their drive can bear it."""
+    record, _, tree = shipped_hand("barrett")
+    cube = object_of_record(mesh_record("cube", trimesh.creation.box([0.03] * 3)))
+    posture = tree.listed_values((tree.joint_open + 0.2 * (tree.joint_upper - tree.joint_open))[None].astype("f4"))[0]
+    model = build_model(Scene(hand_of_record(record, no_cut), (cube,)), PROTOCOLS["fc"].by(engine), posture).own()
+    M, m = model.joint_matrix, model.mujoco
+    column = int(np.flatnonzero((M != 0).sum(0) > 1)[-1])
+    joints = np.flatnonzero(M[:, column])  # of one drive; of the model, too, as the hand comes first
+    outer = int(m.jnt_bodyid[joints[-1]])
+    world = MujocoWorld(model)
+    world.begin(posture, np.array([[1.0, 2.0, 3.0, 1, 0, 0, 0]]))
+    torque = 0.1 * world.data.xaxis[joints[-1]]
+    spin = np.zeros((3, m.nv))
+    mujoco.mj_jacBody(m, world.data, None, spin, outer)
+    asked = M[joints, column] @ (spin.T @ torque)[m.jnt_dofadr[joints]]
+    m.jnt_actfrclimited[joints], m.jnt_actfrcrange[joints] = 1, share * abs(asked) * np.array([-1, 1])
+    world = make_world(model)
+    world.begin(posture, np.array([[1.0, 2.0, 3.0, 1, 0, 0, 0]]))
+    before = world.hand_joints().copy()
+    world.press({outer: (np.zeros(3), torque)})
+    world.step(300)
+    moved = np.abs((world.hand_joints() - before)[joints] / M[joints, column])
+    yields = abs(asked) / model.protocol.stiffness
+    assert (moved > 5 * yields).all() if share < 1 else (moved < 2 * yields).all(), moved / yields

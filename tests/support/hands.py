@@ -1,11 +1,15 @@
 """Hands that the tests build: the shipped Allegro, and real models where they lie beside the checkout."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from support.places import ASSETS
 
+from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
@@ -48,6 +52,13 @@ def hand_source(name: str) -> tuple[Path, HandSpec]:
         return path, shipped.spec
     more = {"locked": LOCKED.get(name, {}), "base_link": BASE.get(name)}
     return path, minimal_spec(name, CONTACT[name][:1], **more)
+
+
+def with_efforts(hand: HandArrays, efforts: ArrayLike) -> HandArrays:
+    """The hand with these effort limits of its joints, (K,) or one of all [N m or N]."""
+    tree = hand.model.tree
+    limits = np.broadcast_to(np.asarray(efforts, np.float32), tree.joint_effort.shape)
+    return upload_hand(replace(hand.model, tree=replace(tree, joint_effort=limits)), hand.device)
 
 
 @cache

@@ -205,7 +205,7 @@ def test_hand_file_explains_every_key(tmp_path):
 
 def test_joints_are_held_inside_their_limits():
     """The middle and the ends of a range are rounded, but not out of it."""
-    joint = Joint("j", "a", "b", np.eye(4), True, False, np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, None)
+    joint = Joint("j", "a", "b", np.eye(4), True, False, np.array([0.0, 0.0, 1.0]), -np.pi, np.pi, None, np.inf)
     for share in (0.0, 0.5, 1.0):
         assert joint.lower <= held_value(joint, share) <= joint.upper
     assert held_value(joint) == 0.0

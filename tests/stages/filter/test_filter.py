@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.hands import with_efforts
 from support.wrench import residual
 
 from lgrasp.engine.batch import run_stages
@@ -158,6 +159,22 @@ def test_soft_grasps_are_squeezed_less(finished, touching, inputs, tables, conte
     np.testing.assert_allclose(gentle.q_squeeze, inside, atol=2e-4)
     np.testing.assert_array_equal(gentle.q, grasps.q)
     np.testing.assert_array_equal(gentle.contact_forces, grasps.contact_forces)
+
+
+def test_no_joint_presses_harder_than_its_effort(finished, touching, inputs, tables, context, swift):
+    """Where a joint of the hand is too weak, all its joints press less; nothing else changes."""
+    grasps, _, bounds = finished
+    tree = inputs.hand.model.tree
+    torque, _ = squeeze(grasps, touching, tree, bounds)
+    efforts = np.full(tree.joint_effort.shape, np.inf)
+    efforts[::2] = np.quantile(np.abs(torque), 0.9)
+    weak, _ = run(tables.search, swift.params("filter"), context.changed(hand=with_efforts(context.hand, efforts)))
+    share = (efforts / np.maximum(np.abs(torque), 1e-9)).min(1).clip(max=1)
+    assert 10 < (share < 1).sum() < len(grasps)
+    _, inside = squeeze(grasps, touching, tree, bounds, share)
+    np.testing.assert_allclose(weak.q_squeeze, inside, atol=2e-4)
+    np.testing.assert_array_equal(weak.q, grasps.q)
+    assert (bounds.squeeze_stiffness * np.abs(weak.q_squeeze - weak.q) <= efforts + 1e-5).all()
 
 
 def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
