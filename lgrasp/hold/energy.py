@@ -123,9 +123,15 @@ def contact_slope(m: Material, contact: Contact, y: wp.vec4, z: wp.vec4):
 
 
 @wp.func
+def spring_effort(m: Material, k: wp.int32, dq: wp.float32, w: Scratch):
+    """What the drive of dof k would resist its motion dq with if nothing limited it [N m or N]."""
+    return m.drive * w.scale[k] * (w.q[k] + dq - w.target[k])
+
+
+@wp.func
 def drive_effort(m: Material, k: wp.int32, dq: wp.float32, w: Scratch):
     """What the drive of dof k resists its motion dq with [N m or N]: a spring up to its effort limit."""
-    return wp.clamp(m.drive * w.scale[k] * (w.q[k] + dq - w.target[k]), -w.effort[k], w.effort[k])
+    return wp.clamp(spring_effort(m, k, dq, w), -w.effort[k], w.effort[k])
 
 
 @wp.func

@@ -10,6 +10,7 @@ from lgrasp.hold.energy import (
     contact_slope,
     drive_effort,
     relative_motion,
+    spring_effort,
     stop_effort,
     twist_stiffness,
 )
@@ -132,6 +133,7 @@ def _share_of_step(
     """Share of a step after which the energy rises again: where its slope, which only rises, passes zero; 1 at most."""
     first = float(0.0)
     rise = float(0.0)
+    limited = int(0)
     if w.lane == 0:
         turn = wp.spatial_bottom(move)
         by_turn = body.inertia * turn
@@ -141,9 +143,13 @@ def _share_of_step(
         rise = wp.dot(by_turn, turn) + body.mass * wp.dot(wp.spatial_top(move), wp.spatial_top(move))
     dofs = hand.kin.dof_first[hand.kin.groups]
     for k in range(w.lane, dofs, w.lanes):
+        stiff = m.drive * w.scale[k]
         drag = m.drag * w.scale[k]
-        first += w.step[k] * drag * w.dq[k]
-        rise += w.step[k] * w.step[k] * drag
+        effort = spring_effort(m, k, w.dq[k], w)
+        first += w.step[k] * (effort + drag * w.dq[k])
+        rise += w.step[k] * w.step[k] * (stiff + drag)
+        if wp.max(wp.abs(effort), wp.abs(effort + stiff * w.step[k])) > w.effort[k]:
+            limited = 1
     low = float(0.0)
     high = float(1.0)
     slope_low = slope
@@ -155,7 +161,9 @@ def _share_of_step(
             here += contact_slope(m, w.contacts[c], w.Y[c] + w.Z[c] * share, w.Z[c])
         for k in range(w.lane, dofs, w.lanes):
             there = w.dq[k] + share * w.step[k]
-            here += w.step[k] * (drive_effort(m, k, there, w) + stop_effort(hand, m, k, there, w))
+            here += w.step[k] * stop_effort(hand, m, k, there, w)
+            if limited == 1:
+                here += w.step[k] * (drive_effort(m, k, there, w) - spring_effort(m, k, there, w))
         here = lanes_sum(here)
         if (attempt == 0 and here <= 0.0) or wp.abs(here) < -0.1 * slope:
             break
