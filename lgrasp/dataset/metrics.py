@@ -18,6 +18,9 @@ from lgrasp.runtime.processes import ProcessPool, none_killed
 METRICS = {"epsilon_exact": "", "volume": ""}
 """Units of the metrics that can be added (docs/reference/metrics.md defines them)."""
 
+MEASURED = "_measured"
+"""End of the names of statistics that tell with which numbers a metric was measured."""
+
 TASK_ROWS = 32
 _ROW = ("candidate", "q", "contact_points")  # what tells rows apart
 _Map = Callable[..., Iterable[np.ndarray]]
@@ -84,21 +87,22 @@ def mass_frame(record: ObjectRecord) -> tuple[np.ndarray, float]:
     return center, float(np.linalg.norm(vertices - center, axis=1).max())
 
 
-def is_extended(target: Path, source: Path, names: Sequence[str]) -> bool:
-    """True if there is already a complete copy of a shard with the metrics.
+def measured_in(target: Path, source: Path) -> dict[str, str] | None:
+    """The numbers (JSON) with which a complete copy of a shard was measured, by what was added; None: there is none.
 
     Raises:
         OutputError: Something else is in its place.
     """
     if not os.path.lexists(target) or validate_shard(target):
-        return False
+        return None
     with ShardReader(source) as old, ShardReader(target) as new:
         mine, theirs = ({**reader.attributes, "text_sha256": ""} for reader in (old, new))
         if mine != theirs or not all(
             np.array_equal(old.column(name), new.column(name), equal_nan=name != "candidate") for name in _ROW
         ):
             raise OutputError(f"{target} holds other rows than {source}; choose another --out, or --overwrite")
-        return all(f"metrics/{name}" in new.columns for name in names)
+        told = {name.removesuffix(MEASURED): text for name, text in new.statistics.items() if name.endswith(MEASURED)}
+        return {name: str(text) for name, text in told.items()}
 
 
 @contextmanager

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -91,7 +92,12 @@ class ShardJob(ShardRequest, Job):
         with locked(part.source) if self.in_place else nullcontext():
             if self.part_key(part) != key:
                 raise ShardError(f"{part.source}: its rows were replaced while they were worked on; run it again")
-            extend_shard(part.source, part.file, **added)
+            extend_shard(self.extended(part), part.file, **added)
+
+    def extended(self, part: Part) -> Path:
+        """The file that has the columns of a part but for those that are added."""
+        assert part.source is not None
+        return part.source
 
     def marked(self, shard: Shard, key: str, statistics: Mapping[str, int | float | str]) -> Shard:
         """The shard with more statistics, and the :meth:`part_key` that tells what it was made from."""

@@ -1,5 +1,6 @@
 """How the run of a shard differs from the one that is requested, in a few words."""
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,6 +21,16 @@ def config_difference(there: Mapping[str, Any], requested: Mapping[str, Any]) ->
         names = ["pipeline"]
     names.sort(key=lambda name: name in _LAST)
     return tell_difference(old, new, names)
+
+
+def text_difference(there: str, requested: str) -> str:
+    """The same of settings that are stored as JSON; of those that cannot be read "unknown there"."""
+    if there == requested:
+        return ""
+    try:
+        return config_difference(json.loads(there), json.loads(requested)) or "unknown there"
+    except (ValueError, AttributeError, TypeError, RecursionError):
+        return "unknown there"
 
 
 def _values(config: Mapping[str, Any]) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Copies of shards with more metrics."""
 
+import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -8,15 +9,16 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.metrics import METRICS, TASK_ROWS, is_extended, measure_shard, process_map
+from lgrasp.dataset.metrics import MEASURED, METRICS, TASK_ROWS, measure_shard, measured_in, process_map
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.dataset.report.write import read_dataset
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import ShardJob
-from lgrasp.errors import ShardError
+from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.rows import METRIC_UNITS
+from lgrasp.jobs.difference import text_difference
 from lgrasp.jobs.requests.shards import MetricsRequest
 from lgrasp.jobs.shard_inputs import arrays_of_shard, object_of_shard
 from lgrasp.object.arrays import upload_object
@@ -33,6 +35,7 @@ class MetricsJob(MetricsRequest, ShardJob):
 
     _open: ExitStack = PrivateAttr(default_factory=ExitStack)
     _each: Any = PrivateAttr(None)
+    _copies: dict[int, Path] = PrivateAttr(default_factory=dict)
 
     def key(self) -> str:
         return content_key("metrics", 1, names=list(self.add), settings=list(self.settings))
@@ -47,10 +50,32 @@ class MetricsJob(MetricsRequest, ShardJob):
             raise ShardError(f"{reader.path}: object '{names[0]}' is a point cloud; the hold test needs a mesh")
 
     def present(self, parts: Sequence[Part]) -> dict[int, int]:
-        """A copy tells by its rows and metrics whether it may stay; other numbers are not seen in it."""
-        if self.settings:
-            return {}
-        return {p.number: p.rows for p in parts if p.source and is_extended(p.file, p.source, self._names())}
+        """A copy tells with which numbers it was measured; metrics that it lacks are added to it.
+
+        Raises:
+            OutputError: a copy was measured with other numbers, or is of other rows.
+        """
+        present = {}
+        for part in parts:
+            assert part.source is not None
+            there = measured_in(part.file, part.source)
+            if there is None:
+                continue
+            with ShardReader(part.source) as reader:
+                asked = self._measured(reader)
+            for name in asked.keys() & there.keys():
+                if how := text_difference(there[name], asked[name]):
+                    raise OutputError(
+                        f"{part.file} has {name} measured with other numbers ({how}); choose another --out, or "
+                        "--overwrite to replace it"
+                    )
+            self._copies[part.number] = part.file
+            if asked.keys() <= there.keys():
+                present[part.number] = part.rows
+        return present
+
+    def extended(self, part: Part) -> Path:
+        return self._copies.get(part.number) or super().extended(part)
 
     def load(self, events: Events, missing: bool) -> None:
         if HOLD in self.add:
@@ -60,6 +85,7 @@ class MetricsJob(MetricsRequest, ShardJob):
         assert part.source is not None
         with ShardReader(part.source) as reader:
             friction, key = self.numbers(stored_bounds(reader.header.config))[0].friction, self.key_of(reader)
+            told = {name + MEASURED: text for name, text in self._measured(reader).items()}
         workers, others = threads(self.workers), [name for name in self.add if name != HOLD]
         kinds, columns = (HOLD in self.add) + bool(others), {}
         if others:
@@ -72,7 +98,7 @@ class MetricsJob(MetricsRequest, ShardJob):
         if HOLD in self.add:
             first = part.rows * (kinds - 1)
             columns |= self._tried(part, workers, lambda done: progress((first + done) // kinds))
-        return Made(part.rows, (key, {"metrics": columns, "units": METRIC_UNITS | METRICS}))
+        return Made(part.rows, (key, {"metrics": columns, "units": METRIC_UNITS | METRICS, "statistics": told}))
 
     def close(self) -> None:
         self._open.close()
@@ -87,6 +113,12 @@ class MetricsJob(MetricsRequest, ShardJob):
             "metrics": self._names(),
             "sets": _sets(outcome.paths),
         }
+
+    def _measured(self, reader: ShardReader) -> dict[str, str]:
+        """With which numbers (JSON) each metric that is added to a shard is measured."""
+        bounds, test = self.numbers(stored_bounds(reader.header.config))
+        numbers = {HOLD: test.model_dump(mode="json")}
+        return {name: json.dumps(numbers.get(name, {"friction": bounds.friction}), sort_keys=True) for name in self.add}
 
     def _names(self) -> list[str]:
         """All metrics that are added."""

@@ -122,7 +122,8 @@ def test_all_else_stays(tmp_path, make_shard, same_rows):
     metrics = {name: values for name, values in new.grasps.metrics.items() if name != "volume"}
     units = {name: unit for name, unit in new.grasps.metric_units.items() if name != "volume"}
     same_rows(shard.grasps, replace(new.grasps, metrics=metrics, metric_units=units))
-    assert (new.header, new.statistics) == (shard.header, shard.statistics)
+    assert new.header == shard.header
+    assert new.statistics == {**shard.statistics, "volume_measured": '{"friction": 0.5}'}
     with h5py.File(tmp_path / "out" / "a.h5") as file:
         assert file["mine/numbers"][:].tolist() == [0, 1, 2]
     # a metric that is there is replaced
@@ -187,6 +188,33 @@ def test_resume(tmp_path, make_shard):
     write_shard(tmp_path / "in" / "sub" / "0.h5", make_shard(2, seed=9))
     with pytest.raises(OutputError, match=r"0\.h5 holds other rows than .*choose another --out"):
         add_metrics(tmp_path / "in", out, BOTH, workers=1)
+
+
+def test_a_copy_keeps_what_was_measured(tmp_path, make_shard):
+    """More metrics are added to it; one is not measured again with other numbers unless asked to."""
+    write_shard(tmp_path / "in" / "0.h5", make_shard(4, contacts=5))
+    out, path = tmp_path / "out", tmp_path / "out" / "0.h5"
+    add_metrics(tmp_path / "in", out, ["volume"], workers=1)
+    first = read_shard(path).grasps.metrics["volume"]
+    assert add_metrics(tmp_path / "in", out, ["epsilon_exact"], workers=1).made == 4
+    assert set(BOTH) <= set(read_shard(path).grasps.metrics)
+    np.testing.assert_array_equal(read_shard(path).grasps.metrics["volume"], first)
+    slippery = {"settings": ("bounds.friction=0.9",), "workers": 1}
+    words = r"0\.h5 has volume measured with other numbers \(friction: 0\.5 there, 0\.9 requested\); choose another"
+    whole = path.read_bytes()
+    for names in (["volume"], BOTH):
+        with pytest.raises(OutputError, match=words):
+            add_metrics(tmp_path / "in", out, names, **slippery)
+    assert path.read_bytes() == whole
+    run(MetricsJob(shards=(tmp_path / "in",), out=out, add=("volume",), device="cpu", **slippery), resume=False)
+    assert read_shard(path).statistics["volume_measured"] == '{"friction": 0.9}'
+    assert (read_shard(path).grasps.metrics["volume"] > first).any()
+    assert add_metrics(tmp_path / "in", out, ["volume"], **slippery).made == 0
+    with h5py.File(path, "r+") as file:
+        file["statistics"].attrs["volume_measured"] = "[9"
+        del file.attrs["text_sha256"]
+    with pytest.raises(OutputError, match=r"measured with other numbers \(unknown there\)"):
+        add_metrics(tmp_path / "in", out, ["volume"], **slippery)
 
 
 def test_what_cannot_be_done(tmp_path, make_shard):
