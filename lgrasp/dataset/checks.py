@@ -1,12 +1,15 @@
 """Conditions on the values of a shard; used before writing and when validating."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lgrasp.errors import HandError
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows
 from lgrasp.grasp.schema import CHUNK_ROWS
+from lgrasp.hand.urdf import MOVABLE, parse_robot
 
 Column = Callable[[str, int, int], np.ndarray]
 """Rows of the whole file by flat name, first row and the row after the last, as :meth:`ShardReader.column`."""
@@ -45,7 +48,7 @@ def accepted_limits(hand: HandRecord) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hand_problems(hand: HandRecord) -> list[str]:
-    """Problems of a hand's values: limits that are NaN or crossed, repeated names, no URDF."""
+    """Problems of a hand's values: limits that are NaN or crossed, repeated names, no URDF, or one without them."""
     problems = []
     lower, upper = np.asarray(hand.joint_lower), np.asarray(hand.joint_upper)
     if not np.all(lower <= upper):  # NaN fails too
@@ -54,16 +57,38 @@ def hand_problems(hand: HandRecord) -> list[str]:
     for what, names in (("joint_names", hand.joint_names), ("link_names", hand.link_names)):
         if len(set(names)) != len(names):
             problems.append(f"hand/{what}: names repeat")
-    if "<robot" not in hand.urdf:
-        problems.append("hand/urdf: holds no <robot> element")
+    return problems + _urdf_problems(hand)
+
+
+def _urdf_problems(hand: HandRecord) -> list[str]:
+    try:
+        robot, _ = parse_robot(Path("hand/urdf"), hand.urdf.encode())
+    except HandError as error:
+        return [str(error)]
+    links = {link.get("name") for link in robot.iterfind("link")}
+    movable = {joint.get("name") for joint in robot.iterfind("joint") if joint.get("type") in MOVABLE}
+    named = (
+        ("hand: attribute base_link", "link", links, [hand.base_link]),
+        ("hand/link_names", "link", links, hand.link_names),
+        ("hand/joint_names", "movable joint", movable, hand.joint_names),
+    )
+    problems = []
+    for where, what, known, names in named:
+        unknown = [name for name in names if name not in known]
+        if unknown and links:  # shards of earlier releases may have a URDF without any
+            problems.append(f"{where}: its URDF has no {what} {unknown[0]!r}")
     return problems
 
 
 def object_problems(record: ObjectRecord) -> list[str]:
-    """Problems of an object's values: vertices not finite, faces out of range, normals, scale not positive."""
+    """Problems of an object's values: no vertices or not finite ones, faces, normals, planes, regions, scale."""
     where, problems = f"objects/{record.id}", []
     if not np.isfinite(record.vertices).all():
         problems.append(f"{where}/vertices: not finite")
+    if not len(record.vertices):
+        problems.append(f"{where}/vertices: none")
+    if not len(record.faces) and record.normals is None:
+        problems.append(f"{where}: neither faces, as of a mesh, nor normals, as of a point cloud")
     faces = np.asarray(record.faces)
     if faces.size and (faces.min() < 0 or faces.max() >= len(record.vertices)):
         bad = int(faces.min() if faces.min() < 0 else faces.max())
@@ -73,8 +98,11 @@ def object_problems(record: ObjectRecord) -> list[str]:
             problems.append(f"{where}/normals: {len(record.normals)} for {len(record.vertices)} vertices")
         elif not are_unit(record.normals).all():
             problems.append(f"{where}/normals: not of unit length")
-    if record.tables is not None and not (are_unit(record.tables[:, :3]) & np.isfinite(record.tables).all(1)).all():
-        problems.append(f"{where}/tables: a normal is not of unit length, or a number not finite")
+    if record.tables is not None:
+        if not (are_unit(record.tables[:, :3]) & np.isfinite(record.tables).all(1)).all():
+            problems.append(f"{where}/tables: a normal is not of unit length, or a number not finite")
+        if ((record.tables[:, 4] < 0) | (record.tables[:, 4] > 1)).any():
+            problems.append(f"{where}/tables: a probability is not from 0 to 1")
     if record.regions is not None:
         weights = record.regions[:, 3:]
         if not np.isfinite(record.regions).all() or not ((weights >= 0) & (weights <= 1)).all():
@@ -87,14 +115,14 @@ def object_problems(record: ObjectRecord) -> list[str]:
 
 
 def row_problems(
-    rows: GraspRows, hand: HandRecord, object_ids: Sequence[str], column: Column, *, first_row: int = 0
+    rows: GraspRows, hand: HandRecord, objects: Sequence[ObjectRecord], column: Column, *, first_row: int = 0
 ) -> list[str]:
     """Problems of the values of some rows, one line per kind of problem, naming the first row that has it.
 
     Args:
         rows: Rows with the shapes and dtypes of the format.
         hand: The hand they belong to.
-        object_ids: The shard's sorted object ids.
+        objects: The shard's objects, sorted by id.
         column: Rows of the whole shard, for rows of sequences, which refer to others.
         first_row: Index of ``rows[0]`` in the shard.
     """
@@ -104,10 +132,13 @@ def row_problems(
         for name in _HELD:
             require(np.isfinite(getattr(rows, name)), f"{name}: not finite")
         require(~((rows.q < limits[0]) | (rows.q > limits[1])), "q: outside the joint limits by more than 1e-4")
-        _check_poses(rows, len(object_ids), require)
+        _check_poses(rows, len(objects), require)
         _check_contacts(rows, len(hand.link_names), require)
         if rows.table:
-            require(rows.table["pose"] >= 0, "table/pose: negative")
+            planes = np.array([0 if record.tables is None else len(record.tables) for record in objects])
+            index = np.clip(rows.object_index, -1, len(planes) - 1)  # (n, o)
+            pose, known = rows.table["pose"], np.where(index >= 0, planes[index], np.inf).min(axis=1, initial=np.inf)
+            require((pose >= 0) & (pose < known), "table/pose: not a row of the object's tables")
             require(are_unit(rows.table["approach"]), "table/approach: not of unit length")
         if rows.sequence is not None:
             _check_steps(rows, rows.sequence, *limits, require)
@@ -136,6 +167,7 @@ def _check_contacts(rows: GraspRows, links: int, require: Require) -> None:
         require(good, f"{name}: NaN if and only if contact_links is -1")
     require(~contact | are_unit(rows.contact_normals), "contact_normals: not of unit length")
     normal_part = -(rows.contact_forces * rows.contact_normals).sum(axis=-1)  # (n, o, c)
+    require(~contact | (normal_part >= -_UNIT_TOLERANCE), "contact_forces: a force points out of the object")
     total = np.where(contact, normal_part, 0).sum(axis=-1)
     good = ~contact.any(axis=-1) | (np.abs(total - 1) <= _UNIT_TOLERANCE)
     require(good, "contact_forces: normal parts (-force . normal) of an object's contacts do not sum to 1")

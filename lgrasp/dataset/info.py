@@ -44,7 +44,8 @@ def closure_share(paths: Iterable[Path]) -> float | None:
 def asked_type(config: Mapping[str, Any]) -> str | None:
     """The grasp type that all rows of a shard were asked for, None if none was."""
     steered = config.get("steered")
-    return steered.get("grasp_type") if isinstance(steered, dict) else None
+    asked = steered.get("grasp_type") if isinstance(steered, dict) else None
+    return asked if isinstance(asked, str) else None
 
 
 def _describe(reader: ShardReader) -> dict[str, Any]:

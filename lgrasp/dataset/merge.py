@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -177,10 +178,10 @@ def _check_manifest(
 def _tell_gaps(sources: Sequence[_Source]) -> None:
     """Say which shards of a run are not among those merged, as far as their numbers tell."""
     numbers = {part["shard_index"] for source in sources for part in source.parts()}
-    gaps = sorted(set(range(max(numbers))) - numbers)
-    if gaps:
-        named = ", ".join(map(str, gaps[:5])) + (", ..." if len(gaps) > 5 else "")
-        notice(f"{len(gaps)} of {max(numbers) + 1} shards of this run are not merged, by their numbers: {named}")
+    if gaps := max(numbers) + 1 - len(numbers):
+        first = islice((number for number in count() if number not in numbers), min(gaps, 5))
+        named = ", ".join(map(str, first)) + (", ..." if gaps > 5 else "")
+        notice(f"{gaps} of {max(numbers) + 1} shards of this run are not merged, by their numbers: {named}")
 
 
 def _is_merged(path: Path) -> bool:
@@ -234,9 +235,10 @@ def _checked(source: _Source, hand: HandRecord, part: int) -> Iterator[GraspRows
     """The rows between two of a source's ``starts``, some at a time; a ShardError if they do not conform."""
     first, end = source.starts[part : part + 2]
     with ShardReader(source.path) as reader:
+        objects = reader.objects()
         for start in range(first, end, CHUNK_ROWS):
             rows = reader.rows(start, min(start + CHUNK_ROWS, end))
-            problems = row_problems(rows, hand, reader.object_ids, reader.column, first_row=start)
+            problems = row_problems(rows, hand, objects, reader.column, first_row=start)
             if problems:
                 raise ShardError(f"{source.path}: {problems[0]}")
             yield rows

@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import h5py
 import numpy as np
 
+from lgrasp.dataset.checks import hand_problems, object_problems
 from lgrasp.dataset.files import check_heaps, check_regular
 from lgrasp.dataset.structure import expand, format_problems, shard_problems
 from lgrasp.errors import ShardError, short_reason
@@ -51,7 +52,7 @@ class FileReader:
 
     Raises:
         ShardError: On opening, the file is truncated, foreign, of another format version or not of the format's
-            structure; on reading, a checksum does not match.
+            structure; on reading, a checksum does not match, or values of the hand or an object violate the format.
     """
 
     def __init__(
@@ -62,8 +63,7 @@ class FileReader:
         try:
             with reading(self.path):
                 self._nodes, found = problems(self._file)
-            if found:
-                raise ShardError(f"{self.path}: {found[0]}")
+            self._require(found)
         except BaseException:
             self.close()
             raise
@@ -89,12 +89,16 @@ class FileReader:
         """Sorted object ids; ``object_index`` counts in this list."""
         return [path.removeprefix("objects/") for path in expand(self._nodes, "objects/*")]
 
-    def hand(self) -> HandRecord:
-        """The hand, with its mesh files."""
+    def hand(self, *, check: bool = True) -> HandRecord:
+        """The hand, with its mesh files.
+
+        Args:
+            check: Refuse values that violate the format.
+        """
         with reading(self.path):
             nodes, attrs = self._nodes, self.attributes
             blobs = [nodes[path] for path in sorted(expand(nodes, "hand/meshes/*"), key=lambda n: (len(n), n))]
-            return HandRecord(
+            record = HandRecord(
                 name=attrs["hand"],
                 base_link=nodes["hand"].attrs["base_link"],
                 urdf=nodes["hand/urdf"].asstr()[()],
@@ -105,16 +109,18 @@ class FileReader:
                 sha256=attrs["hand_sha256"],
                 meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
             )
+        self._require(check and hand_problems(record))
+        return record
 
-    def object(self, object_id: str) -> ObjectRecord:
-        """One object with its mesh."""
+    def object(self, object_id: str, *, check: bool = True) -> ObjectRecord:
+        """One object with its mesh; ``check`` as of :meth:`hand`."""
         with reading(self.path):
             if object_id not in self.object_ids:
                 raise ShardError(f"{self.path}: no object {object_id!r}; it has {', '.join(self.object_ids)}")
             here = f"objects/{object_id}"
             nodes, attrs = self._nodes, self._nodes[here].attrs
             parts = {name: nodes.get(f"{here}/{name}") for name in ("normals", "tables", "regions")}
-            return ObjectRecord(
+            record = ObjectRecord(
                 id=object_id,
                 name=attrs["name"],
                 scale=float(attrs["scale"]),
@@ -125,17 +131,27 @@ class FileReader:
                 **{name: part[()] for name, part in parts.items() if part is not None},
                 touch_share=float(attrs.get("touch_share", 1.0)),
             )
+        self._require(check and object_problems(record))
+        return record
 
-    def objects(self) -> tuple[ObjectRecord, ...]:
-        """All objects, sorted by id."""
-        return tuple(self.object(i) for i in self.object_ids)
+    def objects(self, *, check: bool = True) -> tuple[ObjectRecord, ...]:
+        """All objects, sorted by id; ``check`` as of :meth:`hand`."""
+        return tuple(self.object(i, check=check) for i in self.object_ids)
+
+    def _require(self, problems: list[str] | Literal[False]) -> None:
+        """A ShardError if there are problems."""
+        if problems:
+            raise ShardError(f"{self.path}: {problems[0]}")
 
     @property
     def statistics(self) -> dict[str, int | float | str]:
         """Counts and seconds, device name."""
         with reading(self.path):
             attrs = self._nodes["statistics"].attrs
-            return {k: v.item() if isinstance(v, np.generic) else v for k, v in sorted(attrs.items())}
+            found = {k: v.item() if isinstance(v, np.generic) else v for k, v in sorted(attrs.items())}
+        wrong = [name for name, value in found.items() if not isinstance(value, int | float | str)]
+        self._require([f"statistics: attribute {name} is neither a number nor a string" for name in wrong])
+        return found
 
 
 class ShardReader(FileReader):

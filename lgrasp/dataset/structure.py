@@ -131,11 +131,48 @@ def structure_problems(nodes: Mapping[str, Any]) -> list[str]:
     """
     groups = (SEQUENCE_DATASETS, tuple(TABLE_FIELDS.values()))
     found = [spec for group in groups if any(spec.path in nodes for spec in group) for spec in group]
-    return [
+    problems = [
         *([] if expand(nodes, "objects/*") else ["objects: no object"]),
         *schema_problems(nodes, (*DATASETS, *found), ATTRIBUTES),
-        *([] if "statistics" in nodes else ["statistics: missing group"]),
+        *([] if isinstance(nodes.get("statistics"), h5py.Group) else ["statistics: missing group"]),
+        *(f"{path}: statistics are attributes, no datasets or groups" for path in expand(nodes, "statistics/*")),
     ]
+    return problems or _origin_problems(nodes[""].attrs, nodes["grasps/q"].shape[0])
+
+
+def _origin_problems(attrs: Mapping[str, Any], rows: int) -> list[str]:
+    """What the header says of its config and of merged files that cannot be, one line each."""
+    problems, config = [], json.loads(attrs["config"])
+    where = "/: attribute config"
+    if not isinstance(config, dict):
+        problems.append(f"{where} is {attrs['config'][:80]!r}, must be a JSON object")
+    elif "bounds" in config and not _are_bounds(config["bounds"]):
+        told = json.dumps(config["bounds"])[:80]
+        problems.append(f"{where}: bounds is {told!r}, must hold a profile (text) and numbers (by their names)")
+    index, merged = int(attrs["shard_index"]), attrs.get("merged_from")
+    if index < 0 and (index < -1 or merged is None):
+        problems.append(f"/: attribute shard_index is {index}, must be 0 or more, or -1 with merged_from")
+    if merged is not None:
+        parts = json.loads(merged)
+        if not isinstance(parts, list) or not parts or not all(map(_is_part, parts)):
+            need = "must be a JSON list of file (text), shard_index and rows (0 or more), one entry at least"
+            problems.append(f"/: attribute merged_from is {merged[:80]!r}, {need}")
+        elif (total := sum(part["rows"] for part in parts)) < rows:
+            problems.append(f"/: attribute merged_from names {total:,} rows, the file has {rows:,}")
+    return problems
+
+
+def _are_bounds(bounds: Any) -> bool:
+    if not isinstance(bounds, dict) or not isinstance(bounds.get("profile"), str):
+        return False
+    numbers = bounds.get("numbers")
+    return isinstance(numbers, dict) and all(type(number) in (int, float) for number in numbers.values())
+
+
+def _is_part(part: Any) -> bool:
+    if not isinstance(part, dict) or not isinstance(part.get("file"), str):
+        return False
+    return all(type(part.get(name)) is int and part[name] >= 0 for name in ("shard_index", "rows"))
 
 
 def schema_problems(
@@ -181,6 +218,8 @@ def _dataset_problems(dataset: Any, path: str, spec: DatasetSpec, dims: dict[str
     actual = dataset.shape if len(expected) == len(spec.shape) else (dataset.shape or ())[: len(expected)]
     if actual is None or len(actual) != len(expected):
         return [f"{path}: shape is {dataset.shape}, must be [{', '.join(map(str, spec.shape))}]"]
+    if spec.dtype == "text" and not actual and h5py.check_string_dtype(dataset.dtype).length is not None:
+        return [f"{path}: dtype is {dataset.dtype}, must be text of variable length"]
     problems = []
     for axis, (size, symbol) in enumerate(zip(actual, expected, strict=True)):
         if isinstance(symbol, int):
@@ -209,6 +248,7 @@ def _attribute_problems(attrs: Any, path: str, spec: AttributeSpec) -> list[str]
     value, (what, reads) = attrs[spec.name], _KINDS[spec.kind]
     if isinstance(reads, str):
         good = np.ndim(value) == 0 and np.asarray(value).dtype.kind in reads
+        good = good and (spec.kind != "bool" or value in (0, 1))
     else:
         try:
             good = isinstance(value, str) and reads(value) is not None

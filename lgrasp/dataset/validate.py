@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any
 
 import h5py
-import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.files import check_heaps
@@ -44,15 +43,16 @@ def file_problems(
 
 def _content_problems(path: str | os.PathLike[str]) -> list[str]:
     with ShardReader(path) as reader, reading(path):
-        hand, objects = reader.hand(), reader.objects()
+        hand, objects = reader.hand(check=False), reader.objects(check=False)
         problems = [*hand_problems(hand), *(problem for record in objects for problem in object_problems(record))]
         if reader.attributes["object_sha256"] != object_set_sha256(objects):
             problems.append("/: attribute object_sha256 does not belong to the objects")
-        for name, value in reader.statistics.items():
-            if np.ndim(value) or not isinstance(value, int | float | str):
-                problems.append(f"statistics: attribute {name} is neither a number nor a string")
+        try:
+            _ = reader.statistics
+        except ShardError as error:
+            problems.append(str(error).removeprefix(f"{path}: "))
         seen: dict[str, str] = {}  # the first block that shows a problem is enough
         for first_row, rows in reader.blocks():
-            for problem in row_problems(rows, hand, reader.object_ids, reader.column, first_row=first_row):
+            for problem in row_problems(rows, hand, objects, reader.column, first_row=first_row):
                 seen.setdefault(problem.rpartition(" (row ")[0], problem)
     return [*problems, *seen.values()]

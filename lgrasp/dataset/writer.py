@@ -98,11 +98,10 @@ def write_shard(path: str | os.PathLike[str], shard: Shard) -> None:
             if values.size:
                 dataset[...] = values
         nodes = finish(file)
-        ids = [o.id for o in shard.objects]
         problems = structure_problems(nodes) or [
             *hand_problems(shard.hand),
             *(problem for record in shard.objects for problem in object_problems(record)),
-            *row_problems(rows, shard.hand, ids, lambda name, a, b: columns[name][a:b]),
+            *row_problems(rows, shard.hand, shard.objects, lambda name, a, b: columns[name][a:b]),
         ]
         if problems:
             raise ShardError(f"cannot write {path}: {problems[0]}")

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -12,11 +13,12 @@ from support.shards import sample_shard
 
 from lgrasp.dataset.exports.formats import export_shards
 from lgrasp.dataset.merge import merge_shards
-from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.reader import ShardReader, read_shard
+from lgrasp.dataset.report.write import report_dataset
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
-from lgrasp.errors import LgraspError, OutputError
+from lgrasp.errors import LgraspError, OutputError, ShardError
 from lgrasp.notices import on_notice
 
 
@@ -123,6 +125,71 @@ def test_every_reader_refuses(tmp_path: Path, tamper: Callable[[h5py.File, Path]
     assert time.monotonic() - start < 60  # they end by themselves
     assert not (tmp_path / "all.h5").exists()
     assert not (tmp_path / "out").exists()
+
+
+def no_object(file: h5py.File) -> None:
+    file.attrs["config"] = "[1]"
+
+
+def no_bounds(file: h5py.File) -> None:
+    file.attrs["config"] = '{"bounds": {}}'
+
+
+def no_parts(file: h5py.File) -> None:
+    file.attrs["merged_from"] = "[{}]"
+
+
+def no_vertices(file: h5py.File) -> None:
+    for path in ("objects/cup/vertices", "objects/cup/faces"):
+        group, name, values = replaced(file, path)
+        group[name] = values[:0]
+
+
+def no_urdf(file: h5py.File) -> None:
+    file["hand/urdf"][()] = "<robot"
+
+
+def array_counted(file: h5py.File) -> None:
+    file["statistics"].attrs["device"] = [1, 2]
+
+
+@pytest.mark.parametrize("tamper", [no_object, no_bounds, no_parts, no_vertices, no_urdf, array_counted])
+def test_nothing_in_a_file_is_trusted(tmp_path: Path, tamper: Callable[[h5py.File], None]) -> None:
+    """Whoever reads a file that was not checked refuses what does not conform, in the words of the check."""
+    path = tmp_path / "a.h5"
+    write_shard(path, sample_shard(5))
+    with h5py.File(path, "r+") as file:
+        del file.attrs["text_sha256"]
+        tamper(file)
+    problems = [f"{path}: {problem}" for problem in validate_shard(path)]
+    assert problems
+    for read in (
+        read_shard,
+        lambda path: merge_shards([path], tmp_path / "all.h5"),
+        lambda path: report_dataset([path], tmp_path / "report.html"),
+    ):
+        with pytest.raises(ShardError) as refused:
+            read(path)
+        assert str(refused.value) in problems
+    assert [file.name for file in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_shard_index_without_end(tmp_path: Path) -> None:
+    lines: list[str] = []
+    on_notice(lines.append)
+    shard = sample_shard(2)
+    write_shard(tmp_path / "a.h5", replace(shard, header=replace(shard.header, shard_index=1 << 60)))
+    merge_shards([tmp_path / "a.h5"], tmp_path / "all.h5")
+    assert lines == [
+        f"{1 << 60} of {(1 << 60) + 1} shards of this run are not merged, by their numbers: 0, 1, 2, 3, 4, ..."
+    ]
+
+
+def test_config_of_another_writer(tmp_path: Path) -> None:
+    """What a config holds is free but for its bounds."""
+    shard, config = sample_shard(5), {"locked": 5, "steered": {"grasp_type": [1]}, "pipeline": {"stages": [[[1]]]}}
+    write_shard(tmp_path / "a.h5", replace(shard, header=replace(shard.header, config=config)))
+    assert report_dataset(tmp_path / "a.h5", tmp_path / "report.html")["rows"] == 5
 
 
 def test_merge_says_what_is_missing_and_replaces_nothing(tmp_path):

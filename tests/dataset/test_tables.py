@@ -39,7 +39,11 @@ def test_merged(tmp_path, same_rows):
 
 @pytest.mark.parametrize(
     ("name", "values", "text"),
-    [("approach", np.ones((5, 3), "f4"), "table/approach: not of unit"), ("pose", np.full(5, -1), "table/pose: neg")],
+    [
+        ("approach", np.ones((5, 3), "f4"), "table/approach: not of unit"),
+        ("pose", np.full(5, -1), "table/pose: not a row of the object's tables"),
+        ("pose", np.full(5, 2), "table/pose: not a row of the object's tables"),
+    ],
 )
 def test_wrong_rows_are_refused(tmp_path, name, values, text):
     shard = sample_on_table()
@@ -47,6 +51,22 @@ def test_wrong_rows_are_refused(tmp_path, name, values, text):
     with pytest.raises(ShardError, match=text):
         write_shard(tmp_path / "s.h5", wrong)
     assert not (tmp_path / "s.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("tables", "text"),
+    [
+        (None, "table/pose: not a row of the object's tables"),
+        ([[0, 0, 1, 0, 1.5], [0, 1, 0, 0, 0]], "objects/cup/tables: a probability is not from 0 to 1"),
+        ([[0, 0, 1, 0, 1], [0, 1, 0, 0, -0.1]], "objects/cup/tables: a probability is not from 0 to 1"),
+        ([[0, 0, 1, 0, np.nan], [0, 1, 0, 0, 0]], "objects/cup/tables: .*a number not finite"),
+    ],
+)
+def test_wrong_planes_are_refused(tmp_path, tables, text):
+    shard = sample_on_table()
+    cup = replace(shard.objects[0], tables=None if tables is None else np.array(tables, "f4"))
+    with pytest.raises(ShardError, match=text):
+        write_shard(tmp_path / "s.h5", replace(shard, objects=[cup]))
 
 
 def test_half_a_group_is_no_shard(tmp_path):

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import h5py
 import numpy as np
 import pytest
@@ -49,6 +51,39 @@ def break_padding(file):
     put("grasps/contact_points", where, 0.0)(file)
 
 
+def pull(file):
+    """Two contacts, of which one pulls as much as the other presses too much."""
+    forces, normals = file["grasps/contact_forces"][()], file["grasps/contact_normals"][()]
+    row, slot = np.argwhere((file["grasps/contact_links"][()] >= 0).sum(2) == 2)[0]
+    one, other = np.flatnonzero(file["grasps/contact_links"][row, slot] >= 0)
+    forces[row, slot, [one, other]] = [[-1.2], [0.2]] * normals[row, slot, [one, other]]
+    file["grasps/contact_forces"][...] = forces
+
+
+def text(dataset, value):
+    def change(file):
+        del file[dataset]
+        file[dataset] = value
+
+    return change
+
+
+def array(dataset, shape, dtype):
+    return text(dataset, np.zeros(shape, dtype))
+
+
+LINKS = [*("palm", "link_0", "link_1", "link_2"), "tip"]
+URDF = "".join(
+    f'<link name="{child}"/><joint name="joint_{k}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+    "</joint>"
+    for k, (parent, child) in enumerate(pairwise(LINKS))
+)
+URDF = f'<robot name="toy"><link name="palm"/>{URDF}</robot>'
+"""Of the hand of the shards."""
+BOUNDS = '{"bounds": {"profile": "strict", "numbers": {"friction": "high"}}}'
+MERGED = '[{"file": "a.h5", "shard_index": 0, "rows": 39}]'
+
+
 def flip_quaternion(file):
     put("grasps/object_pose", (0, 0), file["grasps/object_pose"][0, 0] * [1, 1, 1, -1, -1, -1, -1])(file)
 
@@ -78,6 +113,29 @@ def flip_quaternion(file):
         (lambda f: f.attrs.modify("complete", 0), "incomplete"),
         (lambda f: f.pop("objects") and f.create_group("objects"), "objects: no object"),
         (lambda f: f.pop("statistics"), "statistics: missing group"),
+        (lambda f: f["statistics"].create_dataset("a", data=1), "statistics/a: statistics are attributes"),
+        (lambda f: f["statistics"].attrs.create("a", [1, 2]), "statistics: attribute a is neither a number nor"),
+        (pull, "contact_forces: a force points out of the object"),
+        (text("hand/urdf", np.bytes_("<robot/>")), "hand/urdf: dtype is |S8, must be text of variable length"),
+        (text("hand/urdf", "<robot"), "URDF hand/urdf is not XML"),
+        (text("hand/urdf", "<hand/>"), "URDF hand/urdf: root element is <hand>, expected <robot>"),
+        (text("hand/urdf", '<!DOCTYPE robot [<!ENTITY a "b">]><robot/>'), "URDF hand/urdf declares a DOCTYPE"),
+        (text("hand/urdf", URDF.replace("palm", "back")), "hand: attribute base_link: its URDF has no link 'palm'"),
+        (text("hand/urdf", URDF.replace("link_1", "link_9")), "hand/link_names: its URDF has no link 'link_1'"),
+        (text("hand/urdf", URDF.replace("joint_2", "j")), "hand/joint_names: its URDF has no movable joint 'joint_2'"),
+        (text("hand/urdf", URDF.replace("revolute", "fixed")), "its URDF has no movable joint 'joint_0'"),
+        (array("objects/cup/faces", (0, 3), "i4"), "objects/cup: neither faces, as of a mesh, nor normals, as of a"),
+        (array("objects/cup/vertices", (0, 3), "f4"), "objects/cup/vertices: none"),
+        (lambda f: f["objects/cup"].attrs.create("watertight", 2), "watertight is '2', must be true or false"),
+        (lambda f: f.attrs.modify("shard_index", -5), "shard_index is -5, must be 0 or more, or -1 with merged_from"),
+        (lambda f: f.attrs.modify("shard_index", -1), "shard_index is -1, must be 0 or more, or -1 with merged_from"),
+        (lambda f: f.attrs.modify("config", "[1]"), "config is '[1]', must be a JSON object"),
+        (lambda f: f.attrs.modify("config", '{"bounds": {}}'), "config: bounds is '{}', must hold a profile"),
+        (lambda f: f.attrs.modify("config", BOUNDS), "must hold a profile (text) and numbers (by their names)"),
+        (lambda f: f.attrs.create("merged_from", "{}"), "merged_from is '{}', must be a JSON list of file (text)"),
+        (lambda f: f.attrs.create("merged_from", "[{}]"), "merged_from is '[{}]', must be a JSON list of file (text)"),
+        (lambda f: f.attrs.create("merged_from", "[]"), "merged_from is '[]', must be a JSON list of file (text)"),
+        (lambda f: f.attrs.create("merged_from", MERGED), "merged_from names 39 rows, the file has 40"),
         (lambda f: f.move("grasps/q", "grasps/p"), "grasps/q: missing dataset"),
     ],
 )
@@ -112,6 +170,17 @@ def test_wrong_dtype_and_shape_of_every_dataset(path, spec):
 def test_every_required_attribute_is_required(path, spec):
     edit(path, lambda file: file[expand(members(file), spec.path)[0] or "/"].attrs.pop(spec.name))
     assert any(spec.name in line for line in validate_shard(path))
+
+
+def test_what_may_be_is_accepted(path):
+    """A URDF with what lgrasp does not use, a config that tells no bounds, and a merged file."""
+
+    def change(file):
+        text("hand/urdf", URDF.replace("</robot>", '<gazebo/><joint name="f" type="floating"/></robot>'))(file)
+        file.attrs.update(config="{}", shard_index=-1, merged_from=MERGED.replace("39", "40"))
+
+    edit(path, change)
+    assert validate_shard(path) == []
 
 
 def test_changed_text_is_noticed(path):

@@ -11,6 +11,7 @@ from support.kinematics import link_poses
 from support.solids import YOU, no_cut, prism
 
 from lgrasp.engine.cache import Cache
+from lgrasp.errors import ShardError
 from lgrasp.geometry.decompose import decompose
 from lgrasp.hand.distance import signed_distance
 from lgrasp.simulate.assemble import bare_urdf
@@ -57,6 +58,14 @@ def test_links_are_where_the_urdf_puts_them(name: str):
         T = wanted[link]
         np.testing.assert_allclose(R_base.T @ (data.xpos[body] - base.xpos), T[:3, 3], atol=1e-6, err_msg=link)
         np.testing.assert_allclose(R_base.T @ data.xmat[body].reshape(3, 3), T[:3, :3], atol=1e-6, err_msg=link)
+
+
+@pytest.mark.parametrize("change", [{"joint_names": ["joint_3.0", "other"]}, {"base_link": "other"}])
+def test_columns_without_a_joint_are_refused(change: dict[str, Any]):
+    """They would stay where the simulator puts them."""
+    record, _, _ = shipped_hand("allegro")
+    with pytest.raises(ShardError, match="hand 'allegro': its URDF has no link or joint 'other'"):
+        hand_of_record(replace(record, **change), no_cut)
 
 
 def test_drives_are_near_critically_damped(jaws: Jaws):

@@ -56,7 +56,7 @@ def _head(reader: ShardReader) -> Head:
     indices = [part["shard_index"] for part in header.merged_from] or [header.shard_index]
     hand = (str(attributes["hand"]), str(attributes["hand_sha256"]))
     try:
-        stages = [next(iter(stage)) for stage in header.config["pipeline"]["stages"]]
+        stages = [str(next(iter(stage))) for stage in header.config["pipeline"]["stages"]]
     except (KeyError, TypeError, StopIteration):  # of another writer
         stages = []
     return Head(

@@ -89,7 +89,8 @@ def read_dataset(
     for head in heads:
         with ShardReader(head.path, invalid=False) as reader:
             if head.hand not in hands:
-                hands[head.hand] = HandRows(reader.hand(), device, tuple(head.header.config.get("locked", ())))
+                locked = head.header.config.get("locked")
+                hands[head.hand] = HandRows(reader.hand(), device, locked if isinstance(locked, dict) else ())
             if before is not None and (head.hand, head.labels) != (before.hand, before.labels):
                 hands[before.hand].close()
             hands[head.hand].add(reader, head.labels, advanced)

@@ -196,15 +196,10 @@ def _entry(path: Path) -> dict[str, Any]:
 
 def _check_rows(path: Path, shard: Shard) -> None:
     """Refuse what cannot be repaired; joints outside their limits can."""
-    rows, hand, tables = shard.grasps, shard.hand, shard.objects[0].tables
-    known = 0 if tables is None else len(tables)
-    if rows.table and int(np.max(rows.table["pose"])) >= known:
-        raise ShardError(f"{path}: table/pose: {int(np.max(rows.table['pose']))}, its object has {known} planes")
+    rows, hand = shard.grasps, shard.hand
     q = np.where(np.isfinite(rows.q), np.clip(rows.q, hand.joint_lower, hand.joint_upper), rows.q)
     columns = rows.columns()
-    problems = row_problems(
-        replace(rows, q=q), hand, [shard.objects[0].id], lambda name, first, end: columns[name][first:end]
-    )
+    problems = row_problems(replace(rows, q=q), hand, shard.objects, lambda name, first, end: columns[name][first:end])
     if problems:
         raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be refined")
 

@@ -4,6 +4,7 @@ import json
 import tarfile
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -209,7 +210,7 @@ def test_a_hand_that_cannot_be_used_is_named(tmp_path, shards):
     hand = shards.hand("allegro")
     for urdf, words in [
         ("<robot", "not XML"),
-        (hand.urdf.replace('name="joint_3.0"', 'name="other"'), "no joint 'joint_3.0'"),
+        (hand.urdf.replace('name="joint_3.0"', 'name="other"'), "no movable joint 'joint_3.0'"),
         (
             hand.urdf.replace(
                 "<collision>", '<collision><geometry><mesh filename="x.stl"/></geometry></collision><collision>', 1
@@ -217,7 +218,9 @@ def test_a_hand_that_cannot_be_used_is_named(tmp_path, shards):
             "x.stl",
         ),
     ]:
-        shards.make(tmp_path / "a.h5", replace(hand, urdf=urdf + "<robot" * (urdf == "<robot")), n=1)
+        shards.make(tmp_path / "a.h5", hand, n=1)
+        with h5py.File(tmp_path / "a.h5", "r+") as file:
+            file["hand/urdf"][()] = urdf
         for form in ("dexgraspnet", "mjcf"):
             with pytest.raises(LgraspError, match=words):
                 export_shards(tmp_path / "a.h5", tmp_path / "out", form)
