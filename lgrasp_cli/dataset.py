@@ -92,7 +92,7 @@ def metrics(
         list[str] | None, set_option(help="Measure with another value, such as bounds.friction=0.8 or hold.draws=16.")
     ] = None,
 ) -> None:
-    """Copy shards and add quality metrics to the copies; existing copies are kept, or get what they lack.
+    """Copy shards and add quality metrics to the copies; existing copies are kept or extended.
 
     Metric hold tests how well grasps hold. Subfolders are searched and recreated in --out.
     docs/reference/metrics.md defines the metrics.

@@ -85,10 +85,15 @@ def show_hand(name: HandArgument) -> Answer:
         *(("note", note) for note in hand["notes"]),
     ]
     rows = [
-        ("shared" if j["finger"] is None else str(j["finger"]), j["name"], f"{j['lower']:.3f}", f"{j['upper']:.3f}")
+        (
+            "shared" if j["finger"] is None else str(j["finger"]),
+            j["name"],
+            *(f"{j[end]:.3f}" for end in ("lower", "upper")),
+            "none" if j["effort"] is None else f"{j['effort']:g}",
+        )
         for j in hand["joints"]
     ]
-    table = TextTable(("finger", "joint", "lower", "upper"), rows, right=("lower", "upper"))
+    table = TextTable(("finger", "joint", "lower", "upper", "effort"), rows, right=("lower", "upper", "effort"))
     return Answer(hand, [[(what, " ".join(text.split())) for what, text in pairs], "", table])
 
 

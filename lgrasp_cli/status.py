@@ -15,10 +15,7 @@ def status(
     ] = None,
     verify: Annotated[bool, Option("--verify", help="Also read the files and compare their SHA-256.")] = False,
 ) -> Answer:
-    """Show how many rows and shards of each run exist, and what is missing or wrong, by manifest.json and the sizes of
-    the files.
-
-    What is in the files is not looked at: --verify compares their SHA-256, 'lgrasp dataset check' reads every byte.
+    """Show how many rows and shards of each run exist, and what is missing or wrong by manifest.json and file sizes.
 
     States: complete, incomplete, running (a process works on it), starved (no more rows were found), damaged (a file is
     not as it was written), foreign (no run of the folder made these files), unlisted (no manifest.json), bad list (it

@@ -271,7 +271,7 @@ def _contents(path: Path) -> _Contents:
     with ShardReader(path) as reader:
         try:
             friction = stored_bounds(reader.header.config).friction
-        except (AttributeError, KeyError, TypeError, ValueError):  # of another writer
+        except (AttributeError, ConfigError, KeyError, TypeError, ValueError):  # of another writer
             from lgrasp.grasp.wrench_space import FRICTION  # slow to load
 
             friction = FRICTION

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, ValidationInfo, model_validator
 
-from lgrasp.config import Params
+from lgrasp.config import Params, parse_model
+from lgrasp.errors import ConfigError
 from lgrasp.math.constants import DRIVE_STIFFNESS
 
 if TYPE_CHECKING:
@@ -191,17 +192,24 @@ class GraspBounds(Params):
         return {"profile": self.profile, "numbers": self.model_dump(mode="json", exclude={"profile"})}
 
 
-def stored_bounds(config: Mapping[str, Any]) -> GraspBounds:
+def stored_bounds(config: Mapping[str, Any], where: object = "shard") -> GraspBounds:
     """The bounds that the rows of a shard passed, by its ``config``; of shards that tell none, the strict ones with the
-    friction that their filter had."""
+    friction that their filter had.
+
+    Args:
+        where: what messages call the shard.
+
+    Raises:
+        ConfigError: a number that cannot be.
+    """
     told = config.get("bounds")
     if told:
         known = {name: x for name, x in told["numbers"].items() if name in GraspBounds.model_fields}
         profile = told["profile"] if told["profile"] in PROFILES else "strict"
-        return GraspBounds.model_validate({"profile": profile} | known)
+        return parse_model(GraspBounds, {"profile": profile} | known, f"{where}: bounds")
     for stage in config.get("pipeline", {}).get("stages", ()) if isinstance(config.get("pipeline"), dict) else ():
         if "friction" in stage.get("filter", {}):
-            return GraspBounds(friction=stage["filter"]["friction"])
+            return parse_model(GraspBounds, {"friction": stage["filter"]["friction"]}, f"{where}: bounds")
     return GraspBounds()
 
 
@@ -210,5 +218,5 @@ def measured_strictly(config: Mapping[str, Any]) -> bool:
     strict friction, as far as it says."""
     try:
         return stored_bounds(config).friction <= GraspBounds().friction
-    except (AttributeError, KeyError, TypeError, ValueError):  # of another writer
+    except (AttributeError, ConfigError, KeyError, TypeError, ValueError):  # of another writer
         return True

@@ -80,6 +80,7 @@ class Packed:
     self_penetration: wp.array(dtype=wp.float32)  # (m,) [m]
     pregrasp_opening: wp.array(dtype=wp.float32)  # (m,) [rad or m]
     squeeze_travel: wp.array(dtype=wp.float32)  # (m,) [m]
+    squeeze_force: wp.array(dtype=wp.float32)  # (m,) [N]
     stable_squeeze: wp.array(dtype=wp.float32)  # (m,) [N]
     closing_travel: wp.array(dtype=wp.float32)  # (m,) [rad or m]
     closing_penetration: wp.array(dtype=wp.float32)  # (m,) [m]

@@ -19,6 +19,7 @@ _SHIFT_STEPS = wp.constant(3)
 _SHIFT_DAMPING = wp.constant(1.0e-4)  # [m2/rad2]
 _SHIFT_STEP = wp.constant(0.4)  # [rad or m] of a joint, at most
 _TINY = wp.constant(1.0e-12)
+_WEAK = wp.constant(0.999)  # share of a force below which effort limits keep the hand from it
 
 
 @wp.func
@@ -231,6 +232,13 @@ def _column_stiffness(hand: Hand, limits: Limits, column: wp.int32):
     return limits.squeeze_stiffness / (arm * arm)
 
 
+@wp.func
+def _stable_share(limits: Limits, packed: Packed, i: wp.int32):
+    """Of ``squeeze_force`` that is ``squeeze_margin`` below what is stable, 1 at most."""
+    most = limits.squeeze_margin * limits.squeeze_force
+    return wp.where(most > packed.stable_squeeze[i], packed.stable_squeeze[i] / most, 1.0)
+
+
 @wp.kernel
 def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), packed_out: Packed):
     """Targets of the squeeze within joint limits; where its force would be nearer to the stable one than
@@ -243,8 +251,7 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
     i = wp.tid()
     if row[i] < 0:
         return
-    most = limits.squeeze_margin * limits.squeeze_force
-    share = wp.where(most > packed_out.stable_squeeze[i], packed_out.stable_squeeze[i] / most, 1.0)
+    share = _stable_share(limits, packed_out, i)
     for c in range(packed_out.q.shape[1]):
         effort = wp.abs(packed_out.q_squeeze[i, c] - packed_out.q[i, c]) * _column_stiffness(hand, limits, c)
         if share * effort > hand.kin.column_effort[c]:
@@ -256,6 +263,7 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
         target = wp.clamp(wanted, hand.kin.column_lower[c], hand.kin.column_upper[c])
         work += _column_stiffness(hand, limits, c) * (wanted - q) * (target - q)
         packed_out.q_squeeze[i, c] = target
+    packed_out.squeeze_force[i] = share * limits.squeeze_force
     packed_out.squeeze_travel[i] = work / wp.max(share * limits.squeeze_force, _LEAST_FORCE)
 
 
@@ -268,7 +276,8 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
 
     Args:
         row_out: (m,) hand of each row, -1 none.
-        counts_out: (reasons,) these rows are moved from those that are kept.
+        counts_out: (reasons,) these rows are moved from those that are kept; WEAK are those that squeeze too little
+            as a joint's effort limit has it.
     """
     i = wp.tid()
     if row_out[i] < 0:
@@ -279,11 +288,16 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     stable = limits.min_stable_squeeze
     if contacts == PINCH:
         stable = wp.max(stable, limits.min_stable_pinch)
-    limp = packed.squeeze_travel[i] < limits.min_squeeze_travel or packed.stable_squeeze[i] < stable
+    limp = packed.squeeze_travel[i] < limits.min_squeeze_travel
+    soft = packed.stable_squeeze[i] < stable
     still = packed.pregrasp_opening[i] < limits.min_pregrasp_opening
     far = packed.closing_travel[i] > limits.max_closing_travel
     through = packed.closing_penetration[i] > limits.max_closing_penetration
-    if limp or still or far or through or packed.epsilon[i] < limits.min_epsilon:
+    if limp or soft or still or far or through or packed.epsilon[i] < limits.min_epsilon:
         row_out[i] = -1
         wp.atomic_sub(counts_out, Outcome.KEPT, 1)
-        wp.atomic_add(counts_out, Outcome.SQUEEZE, 1)
+        wanted = _stable_share(limits, packed, i) * limits.squeeze_force
+        if limp and packed.squeeze_force[i] < _WEAK * wanted:
+            wp.atomic_add(counts_out, Outcome.WEAK, 1)
+        else:
+            wp.atomic_add(counts_out, Outcome.SQUEEZE, 1)

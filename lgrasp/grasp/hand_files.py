@@ -15,12 +15,16 @@ def checked_urdf(record: HandRecord) -> Iterator[Urdf]:
     """The URDF of a hand; its mesh files are there while the block runs.
 
     Raises:
-        ShardError: as of :func:`write_hand`.
+        ShardError: as of :func:`write_hand`, or the base link or a joint is not in the URDF.
         HandError: the URDF or a mesh cannot be used.
     """
     with temporary_folder() as folder:
         try:
-            yield read_urdf(write_hand(record, folder))
+            urdf = read_urdf(write_hand(record, folder))
+            joints = {joint.name for joint in urdf.joints if joint.movable}
+            for name in [*({record.base_link} - set(urdf.links)), *sorted(set(record.joint_names) - joints)]:
+                raise ShardError(f"hand '{record.name}': its URDF has no link or movable joint {name!r}")
+            yield urdf
         except HandError as error:
             raise HandError(str(error).replace(f"{folder}/", "")) from None
 

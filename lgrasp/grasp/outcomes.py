@@ -23,8 +23,9 @@ class Outcome(IntEnum):
     TABLE = 7
     APPROACH = 8
     SQUEEZE = 9
-    TOUCH = 10
-    HOLD = 11
+    WEAK = 10
+    TOUCH = 11
+    HOLD = 12
 
 
 PINCH = wp.constant(2)
@@ -32,9 +33,10 @@ PINCH = wp.constant(2)
 
 REASONS = (
     *("kept", "unused finger", "self-collision", "object collision", "contact", "balance", "unresisted load"),
-    *("table", "approach", "squeeze"),
+    *("table", "approach", "squeeze", "weak"),
 )
-"""Outcomes in words, by code; where a share of the force must be on a region there is one more, SHARED."""
+"""Outcomes in words, by code; ``weak``: effort limits leave too little squeeze. Where a share of the force must be on a
+region there is one more, SHARED."""
 
 SHARED = (*REASONS, "touch")
 
@@ -66,7 +68,7 @@ MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
 METRICS = (
     *("fswo", "gswo", "unresisted_load", "epsilon", "force_closure"),
     *("penetration", "self_penetration", "gap", "normal_error", "pregrasp_opening", "squeeze_travel"),
-    *("stable_squeeze", "closing_travel", "closing_penetration"),
+    *("squeeze_force", "stable_squeeze", "closing_travel", "closing_penetration"),
 )
 """Columns of the metrics table."""
 

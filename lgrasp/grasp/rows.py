@@ -17,6 +17,7 @@ METRIC_UNITS = {
     "normal_error": "rad",
     "pregrasp_opening": "rad or m",
     "squeeze_travel": "m",
+    "squeeze_force": "N",
     "stable_squeeze": "N",
     "closing_travel": "rad or m",
     "closing_penetration": "m",

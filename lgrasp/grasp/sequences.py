@@ -8,7 +8,7 @@ import numpy as np
 from lgrasp.grasp.tables import CONTACTS, GraspTable
 from lgrasp.hand.tree import Tree
 
-_LEAST = ("epsilon", "force_closure", "pregrasp_opening", "squeeze_travel", "stable_squeeze")
+_LEAST = ("epsilon", "force_closure", "pregrasp_opening", "squeeze_travel", "squeeze_force", "stable_squeeze")
 """Metrics of which the smallest of several steps is that of the row; of others it is the largest."""
 
 

@@ -358,6 +358,8 @@ def _effort(path: Path, where: str, joint: etree._Element) -> float:
     """Effort limit of a joint [N m or N]; infinite where none above 0 is given."""
     limit = joint.find("limit")
     effort = 0.0 if limit is None else _number(path, where, limit, "effort", "0")
+    if math.isnan(effort):
+        raise HandError(f"URDF {path}: {where} has effort nan; a number is needed, 0 for no limit")
     return effort if effort > 0 else math.inf
 
 

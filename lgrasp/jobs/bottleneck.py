@@ -42,6 +42,11 @@ def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
                 "bounds.min_stable_pinch=0, bounds.max_closing_travel=10, bounds.max_closing_penetration=0.03, "
                 "bounds.min_pregrasp_opening=0 and bounds.min_epsilon=0 ask for nothing"
             )
+        if 2 * found.get("weak", 0) > whole:
+            reason = (
+                "effort limits of the hand's joints leave too little force (lgrasp hands show tells them); "
+                "bounds.min_squeeze_travel=0 asks for nothing"
+            )
         if share < least:
             worst, least = stage, share
             words = f"{found.get(after, 0):,} of {whole:,} survive: {reason}"

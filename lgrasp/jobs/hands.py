@@ -1,5 +1,6 @@
 """A hand by name, with rules drafted for those of installed packages, and its description."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,8 @@ def describe_hand(name: str) -> dict[str, Any]:
     tree = build_tree(urdf, spec)
     check_spaces(spec, tree, dict(urdf.links))
     finger = dict(zip(tree.joint_column.tolist(), tree.body_group[1:].tolist(), strict=True))
-    limits = zip(tree.joint_names, tree.joint_lower.tolist(), tree.joint_upper.tolist(), strict=True)
+    efforts = [effort if math.isfinite(effort) else None for effort in tree.joint_effort.tolist()]
+    limits = zip(tree.joint_names, tree.joint_lower.tolist(), tree.joint_upper.tolist(), efforts, strict=True)
     return {
         "name": source.name,
         "description": spec.description,
@@ -116,7 +118,8 @@ def describe_hand(name: str) -> dict[str, Any]:
         "source": spec.source,
         "notes": [spec.notes] if isinstance(spec.notes, str) and spec.notes else list(spec.notes),
         "joints": [
-            {"name": joint, "finger": None if joint in tree.shared_names else finger[k], "lower": lower, "upper": upper}
-            for k, (joint, lower, upper) in enumerate(limits)
+            {"name": joint, "finger": None if joint in tree.shared_names else finger[k]}
+            | {"lower": lower, "upper": upper, "effort": effort}
+            for k, (joint, lower, upper, effort) in enumerate(limits)
         ],
     }

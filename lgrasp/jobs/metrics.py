@@ -63,7 +63,7 @@ class MetricsJob(MetricsRequest, ShardJob):
                 continue
             with ShardReader(part.source) as reader:
                 asked = self._measured(reader)
-            for name in asked.keys() & there.keys():
+            for name in sorted(asked.keys() & there.keys()):
                 if how := text_difference(there[name], asked[name]):
                     raise OutputError(
                         f"{part.file} has {name} measured with other numbers ({how}); choose another --out, or "
@@ -84,7 +84,10 @@ class MetricsJob(MetricsRequest, ShardJob):
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
         with ShardReader(part.source) as reader:
-            friction, key = self.numbers(stored_bounds(reader.header.config))[0].friction, self.key_of(reader)
+            friction, key = (
+                self.numbers(stored_bounds(reader.header.config, reader.path))[0].friction,
+                self.key_of(reader),
+            )
             told = {name + MEASURED: text for name, text in self._measured(reader).items()}
         workers, others = threads(self.workers), [name for name in self.add if name != HOLD]
         kinds, columns = (HOLD in self.add) + bool(others), {}
@@ -116,7 +119,7 @@ class MetricsJob(MetricsRequest, ShardJob):
 
     def _measured(self, reader: ShardReader) -> dict[str, str]:
         """With which numbers (JSON) each metric that is added to a shard is measured."""
-        bounds, test = self.numbers(stored_bounds(reader.header.config))
+        bounds, test = self.numbers(stored_bounds(reader.header.config, reader.path))
         numbers = {HOLD: test.model_dump(mode="json")}
         return {name: json.dumps(numbers.get(name, {"friction": bounds.friction}), sort_keys=True) for name in self.add}
 
@@ -136,7 +139,7 @@ class MetricsJob(MetricsRequest, ShardJob):
         shard, device = read_shard(part.source), self.device_used
         hand = arrays_of_shard(self.cache, shard.hand, shard.header.config, device)
         obj = upload_object(object_of_shard(self.cache, shard.objects[0], device), device.alias)
-        test = self.numbers(stored_bounds(shard.header.config))[1]
+        test = self.numbers(stored_bounds(shard.header.config, part.source))[1]
         return try_rows(hand, obj, test, shard.grasps, shard.header.seed, workers=workers, progress=progress)
 
 

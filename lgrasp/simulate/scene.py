@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from lgrasp.errors import ShardError
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.decompose import decompose as cut_mesh
 from lgrasp.grasp.hand_files import checked_urdf
@@ -56,12 +55,8 @@ def hand_of_record(record: HandRecord, decompose: Decompose, device: str = "cpu"
     """The hand of a shard, cut into the convex pieces that the generator uses.
 
     Raises:
-        ShardError: a mesh that the URDF names is not in the shard, or the base link or a joint is not in the URDF.
-        HandError: the URDF or a mesh cannot be used.
+        ShardError, HandError: as of :func:`checked_urdf`.
     """
     with checked_urdf(record) as urdf:
-        joints = {joint.name for joint in urdf.joints if joint.movable}
-        for name in [*({record.base_link} - set(urdf.links)), *(set(record.joint_names) - joints)]:
-            raise ShardError(f"hand '{record.name}': its URDF has no link or joint {name!r}")
         pieces = {link: link_pieces(urdf, link, decompose, device)[0] for link in urdf.links}
     return HandSolids(record, urdf.joints, pieces)

@@ -20,7 +20,7 @@ from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run
 from lgrasp.engine.run import run as generate
-from lgrasp.errors import OutputError, ShardError
+from lgrasp.errors import ConfigError, OutputError, ShardError
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.metrics import MetricsJob
 from lgrasp_cli.dataset import app
@@ -200,7 +200,7 @@ def test_a_copy_keeps_what_was_measured(tmp_path, make_shard):
     assert set(BOTH) <= set(read_shard(path).grasps.metrics)
     np.testing.assert_array_equal(read_shard(path).grasps.metrics["volume"], first)
     slippery = {"settings": ("bounds.friction=0.9",), "workers": 1}
-    words = r"0\.h5 has volume measured with other numbers \(friction: 0\.5 there, 0\.9 requested\); choose another"
+    words = r"0\.h5 has (volume|epsilon_exact) measured with other numbers \(friction: 0\.5 there, 0\.9 requested\); choose another"
     whole = path.read_bytes()
     for names in (["volume"], BOTH):
         with pytest.raises(OutputError, match=words):
@@ -228,6 +228,11 @@ def test_what_cannot_be_done(tmp_path, make_shard):
         add_metrics([tmp_path / "a", tmp_path / "b"], out, ["volume"])
     with pytest.raises(ShardError, match="no such file"):
         add_metrics(tmp_path / "c", out, ["volume"])
+    wide = make_shard(4)
+    told = {"bounds": {"profile": "strict", "numbers": {"max_gap": 0.5}}}
+    write_shard(tmp_path / "w" / "0.h5", replace(wide, header=replace(wide.header, config=told)))
+    with pytest.raises(ConfigError, match=r"w/0\.h5: bounds: .*max_gap"):
+        add_metrics(tmp_path / "w", out, ["volume"])
     with h5py.File(tmp_path / "a" / "0.h5", "r+") as file:
         file["grasps/q"][1, 1] = np.nan
     with pytest.raises(ShardError, match=r"0\.h5: grasps/q: not finite"):

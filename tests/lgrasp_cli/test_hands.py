@@ -39,6 +39,13 @@ def test_list_and_show_tell_the_spaces(cli, jaws):
     assert "opposition spaces  none" in cli("hands", "show", jaws).out
 
 
+def test_show_tells_effort_limits(cli):
+    for hand, text, effort in (("leap", "0.95", pytest.approx(0.95)), ("barrett", "none", None)):
+        joints = json.loads(cli("hands", "show", hand, "--json", "-").out)["joints"]
+        assert all(joint["effort"] == effort for joint in joints)
+        assert cli("hands", "show", hand).out.splitlines()[-1].split()[-1] == text
+
+
 def test_hands_of_packages_are_listed_with_what_installs_them(cli, monkeypatch):
     lines = cli("hands", "list").out.splitlines()
     for name, hand in PACKAGE_HANDS.items():

@@ -64,7 +64,7 @@ def test_links_are_where_the_urdf_puts_them(name: str):
 def test_columns_without_a_joint_are_refused(change: dict[str, Any]):
     """They would stay where the simulator puts them."""
     record, _, _ = shipped_hand("allegro")
-    with pytest.raises(ShardError, match="hand 'allegro': its URDF has no link or joint 'other'"):
+    with pytest.raises(ShardError, match="hand 'allegro': its URDF has no link or movable joint 'other'"):
         hand_of_record(replace(record, **change), no_cut)
 
 

@@ -102,7 +102,7 @@ class RefineJob(RefineRequest, ShardJob):
         _check_rows(part.source, shard)
         hand = self._hand(part.source, shard)
         model = object_of_shard(self.cache, shard.objects[0], self.device_used)
-        told = stored_bounds(shard.header.config)
+        told = stored_bounds(shard.header.config, part.source)
         bounds, params = self.numbers(told)
         begin = time.perf_counter()
         moved = move_rows(

@@ -175,6 +175,22 @@ def test_no_joint_presses_harder_than_its_effort(finished, touching, inputs, tab
     np.testing.assert_allclose(weak.q_squeeze, inside, atol=2e-4)
     np.testing.assert_array_equal(weak.q, grasps.q)
     assert (bounds.squeeze_stiffness * np.abs(weak.q_squeeze - weak.q) <= efforts + 1e-5).all()
+    np.testing.assert_allclose(weak.metrics["squeeze_force"], share * bounds.squeeze_force, rtol=1e-3)
+
+
+def test_hands_that_are_too_weak_are_counted_as_such(finished, tables, context, swift):
+    """Rows that would squeeze far enough if no effort were limited."""
+    grasps, counts, bounds = finished
+    least = float(np.quantile(grasps.metrics["squeeze_travel"], 0.2))
+    limp = context.changed(bounds=bounds.changed(min_squeeze_travel=least))
+    strong, weak = (
+        run(tables.search, swift.params("filter"), case)[1]
+        for case in (limp, limp.changed(hand=with_efforts(context.hand, 1e-3)))
+    )
+    assert strong["weak"] == weak["kept"] == 0
+    assert strong["squeeze"] > 0
+    assert weak["weak"] + weak["squeeze"] == counts["kept"]
+    assert weak["weak"] > 0.9 * counts["kept"]
 
 
 def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
