@@ -1,6 +1,7 @@
 """lgrasp reach: joints of an arm for grasps, against forward kinematics of another library."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,12 +17,17 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.run import run
 from lgrasp.errors import HandError, OutputError, ShardError
 from lgrasp.geometry.poses import compose, inverse, pose_from_matrix, pose_matrix
+from lgrasp.grasp.records import HandRecord
 from lgrasp.jobs.reach import ReachJob
 from lgrasp.reach.arm import read_arm
 from lgrasp.reach.placement import Placement
 from lgrasp.reach.self_collision import ArmSolids, base_pieces
 from lgrasp.reach.targets import CODES
 
+IDLE = (
+    '<link name="idle_{k}"/><joint name="joint_{k}" type="revolute"><parent link="base"/><child link="idle_{k}"/>'
+    '<limit lower="-1" upper="2"/></joint>'
+)
 AT, MOUNT = "0.4,0.1,0.05:30", "0.01,0,0.02:10,20,30"
 PLACED, MOUNTED = (Placement.model_validate(text).pose for text in (AT, MOUNT))
 
@@ -41,13 +47,21 @@ def arm_kinematics(path):
     return forward, np.array([[j.limit.lower, j.limit.upper] for j in model.actuated_joints])
 
 
+def jaws(record: HandRecord, folder: Path, **how) -> HandRecord:
+    """The hand is a gripper with two more joints, which move nothing."""
+    more = "".join(IDLE.format(k=k) for k in "23")
+    text = gripper(folder, **how).read_text().replace("</robot>", f"{more}</robot>")
+    joints, links = ["l", "r", "joint_2", "joint_3"], ["base", "jaw_l", "jaw_r"]
+    return replace(record, urdf=text, base_link="base", joint_names=joints, link_names=links)
+
+
 @pytest.fixture
 def job(tmp_path):
     """job(shard): reaches for the rows of a shard, which is written."""
     path = arm(tmp_path)
 
     def job(shard, **more):
-        hand = replace(shard.hand, urdf=gripper(tmp_path, kind="visual").read_text(), base_link="base")
+        hand = jaws(shard.hand, tmp_path, kind="visual")
         write_shard(tmp_path / "in" / "toy-cup-00000.h5", replace(shard, hand=hand))
         given = {"arm": path, "at": AT, "mount": MOUNT, "device": "cpu", "workers": 1, "cache": Cache(tmp_path / "c")}
         return ReachJob.model_validate(given | {"shards": (tmp_path / "in",)} | more)
@@ -131,7 +145,7 @@ def test_links_of_an_arm_are_apart(tmp_path):
     assert (solids.clear(q) == (gap > 0))[sure].all()
     assert 10 < (gap[sure] < 0).sum() < 290
 
-    record = replace(sample_hand(), urdf=gripper(tmp_path).read_text(), base_link="base")
+    record = jaws(sample_hand(), tmp_path)
     bent = np.array([0, 0, 0, 0, 0, 2.4, 0])
     assert solids.clear(bent[None]).all()
     with_hand = ArmSolids(read_arm(path, None, pose_matrix(np.array([0.06, 0, 0, 1, 0, 0, 0]))), base_pieces(record))
