@@ -66,7 +66,7 @@ def test_what_was_tried_leaves_no_trace(jaws, other: str):
         world.begin(rows.q_pregrasp[0], tilted)
         world.drive(model.controls(rows.q_squeeze[0].astype(float)))
         world.push(np.array([[0.0, 0.5, 0.0]]))
-        world.step(300)
+        world.step(150)
         before = world.state()
         for number in range(tries):
             world.push(np.full((1, 3), 1.0 + number))
