@@ -101,8 +101,8 @@ def measured_in(target: Path, source: Path) -> dict[str, str] | None:
             np.array_equal(old.column(name), new.column(name), equal_nan=name != "candidate") for name in _ROW
         ):
             raise OutputError(f"{target} holds other rows than {source}; choose another --out, or --overwrite")
-        told = {name.removesuffix(MEASURED): text for name, text in new.statistics.items() if name.endswith(MEASURED)}
-        return {name: str(text) for name, text in told.items()}
+        told = new.statistics.items()
+        return {name.removesuffix(MEASURED): str(text) for name, text in told if name.endswith(MEASURED)}
 
 
 @contextmanager

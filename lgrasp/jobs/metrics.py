@@ -16,8 +16,9 @@ from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import OutputError, ShardError
-from lgrasp.grasp.bounds import stored_bounds
+from lgrasp.grasp.bounds import GraspBounds, stored_bounds
 from lgrasp.grasp.rows import METRIC_UNITS
+from lgrasp.hold.params import HoldTest
 from lgrasp.jobs.difference import text_difference
 from lgrasp.jobs.requests.shards import MetricsRequest
 from lgrasp.jobs.shard_inputs import arrays_of_shard, object_of_shard
@@ -62,7 +63,7 @@ class MetricsJob(MetricsRequest, ShardJob):
             if there is None:
                 continue
             with ShardReader(part.source) as reader:
-                asked = self._measured(reader)
+                asked = self._measured(*self._numbers_of(reader))
             for name in sorted(asked.keys() & there.keys()):
                 if how := text_difference(there[name], asked[name]):
                     raise OutputError(
@@ -84,23 +85,20 @@ class MetricsJob(MetricsRequest, ShardJob):
     def make(self, part: Part, progress: PartProgress) -> Made:
         assert part.source is not None
         with ShardReader(part.source) as reader:
-            friction, key = (
-                self.numbers(stored_bounds(reader.header.config, reader.path))[0].friction,
-                self.key_of(reader),
-            )
-            told = {name + MEASURED: text for name, text in self._measured(reader).items()}
+            (bounds, test), key = self._numbers_of(reader), self.key_of(reader)
+        told = {name + MEASURED: text for name, text in self._measured(bounds, test).items()}
         workers, others = threads(self.workers), [name for name in self.add if name != HOLD]
         kinds, columns = (HOLD in self.add) + bool(others), {}
         if others:
             if self._each is None:
                 self._each = self._open.enter_context(process_map(workers))
             found = measure_shard(
-                part.source, friction, self._each, 4 * workers * TASK_ROWS, lambda done: progress(done // kinds)
+                part.source, bounds.friction, self._each, 4 * workers * TASK_ROWS, lambda done: progress(done // kinds)
             )
             columns |= {name: found[name] for name in others}
         if HOLD in self.add:
             first = part.rows * (kinds - 1)
-            columns |= self._tried(part, workers, lambda done: progress((first + done) // kinds))
+            columns |= self._tried(part, test, workers, lambda done: progress((first + done) // kinds))
         return Made(part.rows, (key, {"metrics": columns, "units": METRIC_UNITS | METRICS, "statistics": told}))
 
     def close(self) -> None:
@@ -117,9 +115,12 @@ class MetricsJob(MetricsRequest, ShardJob):
             "sets": _sets(outcome.paths),
         }
 
-    def _measured(self, reader: ShardReader) -> dict[str, str]:
-        """With which numbers (JSON) each metric that is added to a shard is measured."""
-        bounds, test = self.numbers(stored_bounds(reader.header.config, reader.path))
+    def _numbers_of(self, reader: ShardReader) -> tuple[GraspBounds, HoldTest]:
+        """What the rows of a shard are measured with."""
+        return self.numbers(stored_bounds(reader.header.config, reader.path))
+
+    def _measured(self, bounds: GraspBounds, test: HoldTest) -> dict[str, str]:
+        """With which numbers (JSON) each metric that is added is measured."""
         numbers = {HOLD: test.model_dump(mode="json")}
         return {name: json.dumps(numbers.get(name, {"friction": bounds.friction}), sort_keys=True) for name in self.add}
 
@@ -131,7 +132,9 @@ class MetricsJob(MetricsRequest, ShardJob):
 
         return [name for asked in self.add for name in (TRIED if asked == HOLD else (asked,))]
 
-    def _tried(self, part: Part, workers: int, progress: Callable[[int], None]) -> dict[str, np.ndarray]:
+    def _tried(
+        self, part: Part, test: HoldTest, workers: int, progress: Callable[[int], None]
+    ) -> dict[str, np.ndarray]:
         """Metrics of the hold test."""
         from lgrasp.hold.stored import try_rows
 
@@ -139,7 +142,6 @@ class MetricsJob(MetricsRequest, ShardJob):
         shard, device = read_shard(part.source), self.device_used
         hand = arrays_of_shard(self.cache, shard.hand, shard.header.config, device)
         obj = upload_object(object_of_shard(self.cache, shard.objects[0], device), device.alias)
-        test = self.numbers(stored_bounds(shard.header.config, part.source))[1]
         return try_rows(hand, obj, test, shard.grasps, shard.header.seed, workers=workers, progress=progress)
 
 
