@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lgrasp.errors import HandError
+from lgrasp.grasp.hand_files import lacks
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows
 from lgrasp.grasp.schema import CHUNK_ROWS
 from lgrasp.hand.urdf import MOVABLE, parse_robot
@@ -67,17 +68,9 @@ def _urdf_problems(hand: HandRecord) -> list[str]:
         return [str(error)]
     links = {link.get("name") for link in robot.iterfind("link")}
     movable = {joint.get("name") for joint in robot.iterfind("joint") if joint.get("type") in MOVABLE}
-    named = (
-        ("hand: attribute base_link", "link", links, [hand.base_link]),
-        ("hand/link_names", "link", links, hand.link_names),
-        ("hand/joint_names", "movable joint", movable, hand.joint_names),
-    )
-    problems = []
-    for where, what, known, names in named:
-        unknown = [name for name in names if name not in known]
-        if unknown and links:  # shards of earlier releases may have a URDF without any
-            problems.append(f"{where}: its URDF has no {what} {unknown[0]!r}")
-    return problems
+    if not links:  # shards of earlier releases may have a URDF without any
+        return []
+    return [f"{where}: {lack}" for where, lack in lacks(hand, links, movable)]
 
 
 def object_problems(record: ObjectRecord) -> list[str]:

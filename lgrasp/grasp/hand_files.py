@@ -15,18 +15,30 @@ def checked_urdf(record: HandRecord) -> Iterator[Urdf]:
     """The URDF of a hand; its mesh files are there while the block runs.
 
     Raises:
-        ShardError: as of :func:`write_hand`, or the base link or a joint is not in the URDF.
+        ShardError: as of :func:`write_hand`, or the URDF lacks a link or joint that the hand names.
         HandError: the URDF or a mesh cannot be used.
     """
     with temporary_folder() as folder:
         try:
             urdf = read_urdf(write_hand(record, folder))
-            joints = {joint.name for joint in urdf.joints if joint.movable}
-            for name in [*({record.base_link} - set(urdf.links)), *sorted(set(record.joint_names) - joints)]:
-                raise ShardError(f"hand '{record.name}': its URDF has no link or movable joint {name!r}")
+            movable = {joint.name for joint in urdf.joints if joint.movable}
+            for _, lack in lacks(record, set(urdf.links), movable):
+                raise ShardError(f"hand '{record.name}': {lack}")
             yield urdf
         except HandError as error:
             raise HandError(str(error).replace(f"{folder}/", "")) from None
+
+
+def lacks(record: HandRecord, links: set[str], movable: set[str]) -> Iterator[tuple[str, str]]:
+    """What a hand names that its URDF, of these links and movable joints, lacks: where it does, and what is lacking."""
+    named = (
+        ("hand: attribute base_link", "link", links, [record.base_link]),
+        ("hand/link_names", "link", links, record.link_names),
+        ("hand/joint_names", "movable joint", movable, record.joint_names),
+    )
+    for where, what, known, names in named:
+        for name in [name for name in names if name not in known][:1]:
+            yield where, f"its URDF has no {what} {name!r}"
 
 
 def write_hand(record: HandRecord, folder: Path) -> Path:

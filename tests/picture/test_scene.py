@@ -61,5 +61,5 @@ def test_rows_that_cannot_be_shown_say_why(shard, hand, change, message):
 
 
 def test_a_hand_whose_urdf_lacks_a_joint_is_named(shard):
-    with pytest.raises(ShardError, match="no link or movable joint 'elbow'"):
+    with pytest.raises(ShardError, match="no movable joint 'elbow'"):
         HandShape.of_record(replace(shard.hand, joint_names=("l", "elbow")))

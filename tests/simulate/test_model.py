@@ -60,11 +60,18 @@ def test_links_are_where_the_urdf_puts_them(name: str):
         np.testing.assert_allclose(R_base.T @ data.xmat[body].reshape(3, 3), T[:3, :3], atol=1e-6, err_msg=link)
 
 
-@pytest.mark.parametrize("change", [{"joint_names": ["joint_3.0", "other"]}, {"base_link": "other"}])
-def test_columns_without_a_joint_are_refused(change: dict[str, Any]):
+@pytest.mark.parametrize(
+    ("change", "lacking"),
+    [
+        ({"joint_names": ["joint_3.0", "other"]}, "movable joint 'other'"),
+        ({"base_link": "other"}, "link 'other'"),
+        ({"link_names": ["base_link", "other"]}, "link 'other'"),
+    ],
+)
+def test_columns_without_a_joint_are_refused(change: dict[str, Any], lacking: str):
     """They would stay where the simulator puts them."""
     record, _, _ = shipped_hand("allegro")
-    with pytest.raises(ShardError, match="hand 'allegro': its URDF has no link or movable joint 'other'"):
+    with pytest.raises(ShardError, match=f"hand 'allegro': its URDF has no {lacking}"):
         hand_of_record(replace(record, **change), no_cut)
 
 
