@@ -39,7 +39,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
     """Adds verdicts of a physics simulation to shards, in place or to copies."""
 
     command: ClassVar[str] = "simulate"
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)

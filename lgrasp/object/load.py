@@ -25,6 +25,7 @@ from lgrasp.paths import check_file
 
 _FLAT = 1e-4  # thinner than this share of the largest side is a plane
 _ROUNDING = 1e-4  # of a largest side, by files of single precision
+_FARTHEST = 100.0  # [m] from the origin; a shard's numbers are 0.01 mm apart there
 _MOST_UNPACKED = 256 << 20
 _UNITS = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"))
 
@@ -192,12 +193,16 @@ def join_parts(path: Path, meshes: Sequence[trimesh.Trimesh]) -> tuple[np.ndarra
 
 
 def _check_size(label: str, vertices: np.ndarray, scale: float, params: ObjectParams) -> None:
-    """Refuse extents that a unit mistake explains, and planes."""
+    """Refuse extents that a unit mistake explains, planes, and coordinates that single precision blurs."""
     extent = float(np.ptp(vertices, axis=0).max())
     if not params.min_extent * (1 - _ROUNDING) <= extent <= params.max_extent * (1 + _ROUNDING):
         side = f"largest side is {extent:.4g} m" + ("" if scale == 1.0 else f" at scale {scale:g}")
         accepted = f"{params.min_extent:g} to {params.max_extent:g} m is accepted"
         raise ObjectError(f"{label}: {side}; {accepted}{_remedy(extent, scale)}")
+    far = float(np.linalg.norm((vertices.min(axis=0) + vertices.max(axis=0)) / 2))
+    if far > _FARTHEST:
+        accepted = f"up to {_FARTHEST:g} m is accepted; move the mesh there"
+        raise ObjectError(f"{label}: the mesh is {far:,.0f} m from the origin of its coordinates; {accepted}")
     spread = vertices - vertices.mean(axis=0)
     axes = np.linalg.eigh(spread.T @ spread)[1]
     thin = float(np.ptp(spread @ axes, axis=0).min())

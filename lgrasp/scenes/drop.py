@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError, short_reason
-from lgrasp.geometry.poses import canonical, pose_matrix
+from lgrasp.geometry.poses import canonical, pose_matrix, rotated
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.scenes.params import DropParams
 from lgrasp.simulate.builder import add_solid, set_contact, set_options
@@ -52,8 +52,10 @@ def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.rand
         data.qpos[:] = _start(solids, params, rng).ravel()
         seconds = _settle(mujoco, model, data, params)
         pose = data.qpos.reshape(-1, 7).copy()
+        turn = canonical(pose[:, 3:])
+        pose = np.hstack([pose[:, :3] - rotated(turn, np.stack([solid.center for solid in solids])), turn])
         if seconds is not None and _on_table(solids, pose, table):
-            return Settled(np.hstack([pose[:, :3], canonical(pose[:, 3:])]), number, seconds)
+            return Settled(pose, number, seconds)
     raise PhysicsError(
         f"objects {names} did not come to rest on a table of {table:g} m in {params.tries} tries; "
         "use fewer objects, a larger table or a longer drop"
@@ -76,11 +78,11 @@ def _model(mujoco: Any, solids: Sequence[Solid], table: float, params: DropParam
 
 
 def _start(solids: Sequence[Solid], params: DropParams, rng: np.random.Generator) -> np.ndarray:
-    """Random poses (n, 7), each as low as the balls around the objects before it and the table allow."""
+    """Random poses of centres of mass (n, 7), each as low as the table and the balls around earlier objects allow."""
     pose = np.empty((len(solids), 7))
     radius = np.array([max(np.linalg.norm(p - s.center, axis=1).max() for p in s.pieces) for s in solids])
     centre = np.empty((len(solids), 3))
-    for k, solid in enumerate(solids):
+    for k in range(len(solids)):
         turn, way = canonical(rng.standard_normal(4)), 2.0 * np.pi * rng.random()
         away = params.radius * np.sqrt(rng.random())
         x, y = away * np.cos(way), away * np.sin(way)
@@ -92,8 +94,7 @@ def _start(solids: Sequence[Solid], params: DropParams, rng: np.random.Generator
             if rest > 0.0:
                 height = max(height, centre[i, 2] + np.sqrt(rest))
         centre[k] = x, y, height
-        pose[k] = 0.0, 0.0, 0.0, *turn
-        pose[k, :3] = centre[k] - pose_matrix(pose[k])[:3, :3] @ solid.center
+        pose[k] = *centre[k], *turn
     return pose
 
 

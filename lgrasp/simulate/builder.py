@@ -68,7 +68,8 @@ def _scale(mujoco: Any, joint: Any, protocol: Protocol) -> float:
 
 
 def add_solid(mujoco: Any, spec: Any, name: str, solid: Solid, mass: float, inertia: np.ndarray) -> None:
-    """A free body that collides by its convex pieces.
+    """A free body that collides by its convex pieces; its frame is at its centre of mass, however far that is from the
+    object's own.
 
     Args:
         mass: [kg]
@@ -77,8 +78,8 @@ def add_solid(mujoco: Any, spec: Any, name: str, solid: Solid, mass: float, iner
     body = spec.worldbody.add_body(name=name)
     body.add_freejoint()
     for number, vertices in enumerate(solid.pieces):
-        add_hull(mujoco, spec, body, vertices, f"{name} {number}")
-    set_mass(body, mass, solid.center, inertia)
+        add_hull(mujoco, spec, body, vertices - solid.center, f"{name} {number}")
+    set_mass(body, mass, np.zeros(3), inertia)
 
 
 def set_mass(body: Any, mass: float, center: np.ndarray, inertia: np.ndarray) -> None:

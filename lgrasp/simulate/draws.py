@@ -24,16 +24,11 @@ class Draw(NamedTuple):
     shifts: np.ndarray  # (O, 3) [m]
     turns: np.ndarray  # (O, 3) axis times angle [rad]
 
-    def placed(self, poses: np.ndarray, centers: np.ndarray) -> np.ndarray:
-        """Poses of objects (O, 7) with the draw's error.
-
-        Args:
-            centers: centre of mass in each object's frame (O, 3) [m].
-        """
+    def placed(self, poses: np.ndarray) -> np.ndarray:
+        """Poses of objects' centres of mass (O, 7) with the draw's error."""
         before = Rotation.from_quat(np.asarray(poses[:, 3:], float), scalar_first=True)
         after = Rotation.from_rotvec(self.turns) * before
-        at = poses[:, :3] + self.shifts + before.apply(centers) - after.apply(centers)
-        return np.concatenate([at, after.as_quat(scalar_first=True)], axis=1)
+        return np.concatenate([poses[:, :3] + self.shifts, after.as_quat(scalar_first=True)], axis=1)
 
 
 def draw_of(draws: Draws, candidate: int, number: int, objects: int) -> Draw:

@@ -176,7 +176,7 @@ def _carry(world: World, model: Model, course: LiftCourse, home: np.ndarray) -> 
     chunk, total = max(1, round(chunk_of(model.protocol) / dt)), len(course.targets)
     for step in range(total):
         if step == course.closes:
-            pushed = float(moved(world.objects(), home, model.centers)[:, 0].max())
+            pushed = float(moved(world.objects(), home)[:, 0].max())
         if step == course.rises:
             home = world.objects().copy() if table else home
             settled = bool(at_rest(world.velocities()))
@@ -190,7 +190,7 @@ def _carry(world: World, model: Model, course: LiftCourse, home: np.ndarray) -> 
             if world.wild():
                 return Lifted(pushed, settled=settled, diverged=True)
             if step >= counts:
-                far = np.maximum(far, moved(world.objects(), home, model.centers))
+                far = np.maximum(far, moved(world.objects(), home))
                 if bounds.lost(far):
                     break
     return Lifted(pushed, far.max(0), settled, world.on_table())
@@ -203,10 +203,8 @@ def _table_at(model: Model, pose: np.ndarray, number: int) -> tuple[np.ndarray, 
     turn = Rotation.from_quat(pose[3:], scalar_first=True)
     normal, height = planes[number, :3].astype(float), float(planes[number, 3])
     up = turn.apply(normal / np.linalg.norm(normal))
-    below = turn.apply(model.centers[0]) + pose[:3]
-    at = below + (height + up @ pose[:3] - up @ below) * up
     facing = Rotation.align_vectors(up[None], [[0.0, 0.0, 1.0]])[0]
-    return np.concatenate([at, facing.as_quat(scalar_first=True)]), up
+    return np.concatenate([pose[:3] + height * up, facing.as_quat(scalar_first=True)]), up
 
 
 def _placed(at: np.ndarray, turn: np.ndarray, pose: np.ndarray) -> np.ndarray:

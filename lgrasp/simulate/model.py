@@ -59,13 +59,10 @@ class Model:
     base_body: int
     link_body: np.ndarray
     """(L,) body of each of the shard's links, -1: none."""
-    centers: np.ndarray
-    """(O, 3) centre of mass in each object's frame [m]."""
-
     table: TableBody
     """Of protocols that lift off a table."""
     tables: tuple[np.ndarray | None, ...]
-    """Planes that each object rests on (T, 5)."""
+    """Planes that each object rests on (T, 5), in the frame of its centre of mass."""
 
     def controls(self, q: np.ndarray) -> np.ndarray:
         """Targets of the drives at joint positions q (..., K)."""
@@ -139,9 +136,8 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
         object_body=bodies,
         base_body=base,
         link_body=np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, n) for n in hand.link_names]),
-        centers=np.stack([solid.center for solid in solids]),
         table=_table_of(model) if protocol.table else TableBody(-1, np.zeros(0, int), np.zeros(0, int)),
-        tables=tuple(solid.tables for solid in solids),
+        tables=tuple(solid.planes() for solid in solids),
     )
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError
+from lgrasp.geometry.poses import canonical, rotated
 from lgrasp.grasp.records import GraspRows
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.runtime.processes import ProcessPool, none_killed
@@ -21,6 +22,7 @@ from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.protocol import PROTOCOLS, Protocol
 from lgrasp.simulate.scene import Scene
+from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import Verdict, chunk_of, stack_verdicts
 
@@ -37,19 +39,19 @@ class Group(NamedTuple):
     slots: np.ndarray
     """(n, O) which of ``objects`` is in each slot of the table, -1 absent."""
     rows: GraspRows
-    """The rows with the objects in that order, and no others."""
+    """The rows with the objects in that order, and no others; poses and contact points are of their centres of mass."""
 
 
-def group_rows(rows: GraspRows, objects: int) -> Iterator[Group]:
+def group_rows(rows: GraspRows, solids: Sequence[Solid]) -> Iterator[Group]:
     """Groups in the order of their objects.
 
     Args:
-        objects: of the scene.
+        solids: of the scene.
 
     Raises:
         PhysicsError: a row has no object, or one that the scene lacks.
     """
-    index = np.asarray(rows.object_index)
+    index, objects = np.asarray(rows.object_index), len(solids)
     present = (index >= 0).sum(1)
     wrong = np.flatnonzero((present == 0) | (index.max(1, initial=-1) >= objects))
     if len(wrong):
@@ -67,6 +69,10 @@ def group_rows(rows: GraspRows, objects: int) -> Iterator[Group]:
         taken = tuple(int(k) for k in members if k < objects)
         slots = order[found, : len(taken)]
         arrays = {name: getattr(rows, name)[found[:, None], slots] for name in _BY_SLOT}
+        centers = np.stack([solids[k].center for k in taken])
+        pose = arrays["object_pose"] = arrays["object_pose"].astype(float)
+        pose[..., :3] += rotated(canonical(pose[..., 3:]), centers)
+        arrays["contact_points"] = arrays["contact_points"] - centers[:, None]
         arrays |= {name: getattr(rows, name)[found] for name in ("q", "q_pregrasp", "q_squeeze", "candidate")}
         arrays["table"] = {name: values[found] for name, values in rows.table.items()}
         bare = replace(rows, **arrays, metrics={}, metric_units={}, physics={}, physics_protocols={}, sequence=None)
@@ -129,7 +135,7 @@ def verdicts(
         if progress:
             progress(before[0] + done, before[1] + held)
 
-    for group in group_rows(rows, len(scene.objects)):
+    for group in group_rows(rows, scene.objects):
         begin = time.perf_counter()
         model = build_model(scene, protocol, rows.q[0], group.objects)
         _check_held(model, group.rows)

@@ -44,6 +44,14 @@ class Solid:
     notes: tuple[str, ...] = ()
     """What a user should know: the hull stands for the mesh, the mesh is not closed."""
 
+    def planes(self) -> np.ndarray | None:
+        """``tables`` seen from the centre of mass."""
+        if self.tables is None:
+            return None
+        planes = np.array(self.tables, float)
+        planes[:, 3] -= planes[:, :3] @ self.center
+        return planes
+
 
 def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> Solid:
     """The object of a shard as a rigid body, in the frame of its vertices. Where cutting its mesh fails the hull

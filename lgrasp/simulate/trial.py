@@ -59,7 +59,7 @@ class Trial:
         for number in range(draws.count):
             draw = draw_of(draws, int(rows.candidate[i]), number, len(pose))
             tune(self._model, self._compiled, draw)
-            start = draw.placed(pose, self._model.centers)
+            start = draw.placed(pose)
             found.append(self._judge(rows, i, start, self._look(rows, i, start, at_q)))
         return worst(found)
 
@@ -191,7 +191,7 @@ class Trial:
 
     def _moved(self) -> np.ndarray:
         """How far each object is from its start: displacement [m] and rotation [rad], (O, 2)."""
-        return moved(self._world.objects(), self._start, self._model.centers)
+        return moved(self._world.objects(), self._start)
 
 
 def _one(frames: Frames) -> Frames:

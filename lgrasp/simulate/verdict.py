@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from lgrasp.geometry.poses import rotated
 from lgrasp.simulate.protocol import Protocol
 
 CHUNK = 0.05
@@ -181,18 +180,17 @@ def worst(draws: Sequence[Verdict]) -> Verdict:
     return Verdict(**found)
 
 
-def moved(pose: np.ndarray, home: np.ndarray, centers: np.ndarray) -> np.ndarray:
+def moved(pose: np.ndarray, home: np.ndarray) -> np.ndarray:
     """How far objects are from where they started: displacement [m] and rotation [rad], (..., O, 2).
 
     Args:
-        pose, home: now and at the start, (..., O, 7).
-        centers: centre of mass in each object's frame (O, 3) [m].
+        pose, home: now and at the start, of their centres of mass (..., O, 7).
     """
     now, start = np.asarray(pose, float), np.asarray(home, float)
     norm = np.linalg.norm(now[..., 3:], axis=-1) * np.linalg.norm(start[..., 3:], axis=-1)
     cosine = np.abs((now[..., 3:] * start[..., 3:]).sum(-1)) / np.maximum(norm, 1e-12)
-    shift = now[..., :3] - start[..., :3] + rotated(now[..., 3:], centers) - rotated(start[..., 3:], centers)
-    return np.stack([np.linalg.norm(shift, axis=-1), 2 * np.arccos(np.minimum(cosine, 1.0))], axis=-1)
+    shift = np.linalg.norm(now[..., :3] - start[..., :3], axis=-1)
+    return np.stack([shift, 2 * np.arccos(np.minimum(cosine, 1.0))], axis=-1)
 
 
 def at_rest(velocity: np.ndarray) -> np.ndarray:

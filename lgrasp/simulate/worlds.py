@@ -339,4 +339,4 @@ class Worlds:
         Args:
             home: poses at the start, (W, O, 7).
         """
-        return moved(qpos[:, self._model.object_address], home, self._model.centers)
+        return moved(qpos[:, self._model.object_address], home)

@@ -135,6 +135,12 @@ def test_limits_of_the_size_forgive_rounding(side, beyond):
     assert "is accepted" in refused(trimesh.creation.box(extents=[side * beyond] * 3))
 
 
+def test_coordinates_of_a_map():
+    """Single precision blurs them; those of a room are fine."""
+    assert load_mesh(BOX.copy().apply_translation([60, 60, 0])).closed
+    assert "500,000 m from the origin" in refused(BOX.copy().apply_translation([500_000, 100, 0]))
+
+
 def test_scale_of_a_mesh_in_metres_and_bad_scales():
     assert "--scale 1" in refused(BOX, scale=0.001)
     for scale in (0.0, -1.0, float("nan"), float("inf")):

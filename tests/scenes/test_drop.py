@@ -11,7 +11,7 @@ from lgrasp.scenes.params import DropParams
 from lgrasp.simulate.solid import Solid
 
 SIDES = np.array([0.05, 0.07, 0.1])
-SHIFT = np.array([0.01, -0.02, 0.03])  # of the box in its own frame
+SHIFT = np.array([3.01, -2.02, 5.03])  # of the box in its own frame
 
 
 def solid(mesh: trimesh.Trimesh, name: str) -> Solid:

@@ -38,7 +38,7 @@ def six(jaws: Jaws):
 def judge(scene, rows, worlds: int = 8, protocol=FC, all_directions: bool = True):
     from lgrasp.simulate.gpu import WorldTrials
 
-    (group,) = group_rows(rows, len(scene.objects))
+    (group,) = group_rows(rows, scene.objects)
     model = build_model(scene, protocol, rows.q[0], group.objects)
     trials = WorldTrials(model, "cuda:0" if GPU else "cpu", worlds=worlds, all_directions=all_directions)
     return stack_verdicts(protocol, trials.run(group.rows), group.slots)

@@ -11,6 +11,7 @@ from support.twins import twin_rows, twin_shard
 
 from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError, PhysicsError
+from lgrasp.geometry.poses import rotated
 from lgrasp.simulate.lift import course_of
 from lgrasp.simulate.protocol import PROTOCOLS, FreeLift, Lift, Protocol
 from lgrasp.simulate.run import protocol_text
@@ -67,6 +68,19 @@ def test_lifts_what_friction_bears(jaws: Jaws, lift):
     assert slippery["displacement"] > LIFT.most_displacement
     assert slippery["on_table"].all()
     assert not slippery["diverged"].any()
+
+
+def test_frame_of_the_object_does_not_matter(jaws: Jaws, lift):
+    shift, near = np.array([30.0, -20.0, 10.0], "f4"), standing(jaws, 4.0)
+    cube, pose = near.objects[0], near.grasps.object_pose.copy()
+    planes = cube.tables + np.float32([[0, 0, 0, 1, 0]]) * (cube.tables[:, :3] @ shift)[:, None]
+    pose[..., :3] -= rotated(pose[..., 3:], shift)
+    rows = replace(near.grasps, object_pose=pose, contact_points=near.grasps.contact_points + shift)
+    far = replace(near, objects=[replace(cube, vertices=cube.vertices + shift, tables=planes)], grasps=rows)
+    a, b = judge(near, lift), judge(far, lift)
+    assert a["holds"] == b["holds"] == [True]
+    for name in ("displacement", "pushed", "pregrasp_penetration"):
+        np.testing.assert_allclose(a[name], b[name], atol=1e-3, err_msg=name)
 
 
 def test_shaking_counts(jaws: Jaws, lift):

@@ -13,11 +13,13 @@ from support.solids import YOU, no_cut, prism
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ShardError
 from lgrasp.geometry.decompose import decompose
+from lgrasp.geometry.poses import pose_matrix
 from lgrasp.hand.distance import signed_distance
 from lgrasp.simulate.assemble import bare_urdf
 from lgrasp.simulate.model import Model, build_model
+from lgrasp.simulate.mujoco_world import MujocoWorld
 from lgrasp.simulate.protocol import PROTOCOLS
-from lgrasp.simulate.run import verdicts
+from lgrasp.simulate.run import group_rows, verdicts
 from lgrasp.simulate.scene import Scene, hand_of_record, scene_of
 from lgrasp.simulate.solid import object_of_record
 
@@ -97,7 +99,13 @@ def test_inertia_is_that_of_the_mesh(jaws: Jaws):
     (body,) = model.object_body
     mesh.density = FC.mass / mesh.volume
     assert model.mujoco.body_mass[body] == pytest.approx(FC.mass)
-    np.testing.assert_allclose(model.mujoco.body_ipos[body], mesh.center_mass, atol=1e-7)
+    (group,) = group_rows(shard.grasps, scene.objects)
+    world = MujocoWorld(model)
+    world.begin(shard.grasps.q[0], group.rows.object_pose[0])
+    base = world.data.body(model.base_body)
+    T = pose_matrix(shard.grasps.object_pose[0, 0].astype(float))
+    wanted = T[:3, :3] @ mesh.center_mass + T[:3, 3]
+    np.testing.assert_allclose(base.xmat.reshape(3, 3).T @ (world.data.xipos[body] - base.xpos), wanted, atol=1e-7)
     np.testing.assert_allclose(
         np.sort(model.mujoco.body_inertia[body]), np.sort(mesh.principal_inertia_components), rtol=1e-4
     )

@@ -109,7 +109,7 @@ def test_rows_stand_alone(jaws: Jaws, fc):
 
 def test_frame_of_the_object_does_not_matter(jaws: Jaws, fc):
     shard = jaws.shard(press(1.0))
-    shift = np.array([0.3, -0.2, 0.1], "f4")
+    shift = np.array([30.0, -20.0, 10.0], "f4")  # as of scans in the coordinates of a room
     cube = shard.objects[0]
     moved = replace(shard, objects=[replace(cube, vertices=cube.vertices + shift)])
     pose = shard.grasps.object_pose.copy()
@@ -118,7 +118,7 @@ def test_frame_of_the_object_does_not_matter(jaws: Jaws, fc):
     a, b = judge(shard, fc, all_directions=True), judge(moved, fc, rows=rows, all_directions=True)
     np.testing.assert_array_equal(a["directions"], b["directions"])
     for name in ("displacement", "slip", "pregrasp_penetration"):
-        atol = 4e-3 if fc.engine == "physx" else 2e-4  # PhysX has single precision, and creeps
+        atol = 1e-3 if fc.engine == "physx" else 2e-4  # PhysX has single precision, and creeps
         np.testing.assert_allclose(a[name], b[name], atol=atol, err_msg=name)
 
 
