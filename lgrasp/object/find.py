@@ -84,8 +84,11 @@ def find_object(name_or_path: str | os.PathLike[str]) -> Path:
     prefix, colon, name = text.partition(":")
     if colon and prefix in OBJECT_PACKAGES:
         return _package_mesh(text, OBJECT_PACKAGES[prefix], name)
-    near = difflib.get_close_matches(text, named, n=3, cutoff=0.5)
-    hint = f"did you mean {', '.join(near)}?" if near else f"named objects are {', '.join(named) or 'none'}"
+    beside = mesh_files(path.parent) if path.name != text else {}
+    known = {name: name for name in named} | {file.name: str(file) for file in beside.values()}
+    near = [known[name] for name in difflib.get_close_matches(path.name, known, n=3, cutoff=0.5)]
+    holds = f"{path.parent} holds {listed(sorted(file.name for file in beside.values()), 8)}; " if beside else ""
+    hint = f"did you mean {', '.join(near)}?" if near else f"{holds}named objects are {', '.join(named) or 'none'}"
     raise ObjectError(f"object '{text}' is neither a mesh file nor a named object; {hint}")
 
 
