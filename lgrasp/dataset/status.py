@@ -18,9 +18,9 @@ from lgrasp.dataset.manifest import (
 from lgrasp.errors import ShardError
 
 _NEXT = {
-    "incomplete": "run 'lgrasp {job}' again",
+    "incomplete": "repeat the same command",
     "starved": "another pipeline or seed",
-    "damaged": "remove the files, run 'lgrasp {job}' again",
+    "damaged": "remove the files, repeat the same command",
     "foreign": "'lgrasp dataset info' says what they are",
     "unlisted": "the next run in the folder lists them",
     "bad list": "the next run in the folder writes it again",
@@ -102,5 +102,5 @@ def _state(folder: Path, run: ListedRun, found: Differences, working: Any) -> di
         "changed": changed,
         "workers": [{"host": worker.host, "pid": worker.pid} for worker in busy],
         "state": state,
-        "next": _NEXT.get(state, "").format(job=run.job),
+        "next": _NEXT.get(state, ""),
     }

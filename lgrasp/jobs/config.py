@@ -33,7 +33,7 @@ from lgrasp.hand.names import all_hands
 from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest, hand_name, sequence_name
 from lgrasp.jobs.sets import SequenceSets, object_sequences
 from lgrasp.notices import notice
-from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object
+from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object, list_objects, mesh_files
 from lgrasp.steer.params import Steering
 
 
@@ -302,9 +302,16 @@ def _urdf_in_folder(folder: Path | None, hand: str) -> str:
 
 
 def in_folder(folder: Path | None, mesh: str) -> str:
-    """Path of an object in a folder, by file name with or without its suffix; else the name as it is."""
+    """Path of an object in a folder, by file name with or without its suffix; the name as it is of one elsewhere.
+
+    One that is nowhere has the path at which it would be: its error tells what the folder holds.
+    """
     if folder is None:
         return mesh
     here = folder.expanduser()
-    found = next((p for p in (here / mesh, *(here / f"{mesh}{s}" for s in MESH_SUFFIXES)) if p.is_file()), None)
-    return mesh if found is None else str(found)
+    path = here / mesh
+    found = next((p for p in (path, *(here / f"{mesh}{s}" for s in MESH_SUFFIXES)) if p.is_file()), None)
+    found = found or mesh_files(path.parent).get(path.name)
+    if not found and (":" in mesh or mesh in list_objects() or Path(mesh).expanduser().is_file()):
+        return mesh
+    return str(found or path)

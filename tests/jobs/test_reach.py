@@ -231,6 +231,13 @@ def test_arms_that_cannot_be_used(tmp_path, more, tip, match):
         read_arm(arm(tmp_path, more), tip, np.eye(4))
 
 
+def test_an_arm_that_cannot_be_used_is_told_before_shards_are_read(job, tmp_path):
+    asked = job(sample_shard(2), tip="hand")
+    (tmp_path / "in" / "toy-cup-00000.h5").write_bytes(b"no shard")
+    with pytest.raises(HandError, match="no link 'hand'"):
+        run(asked)
+
+
 def test_an_arm_without_its_meshes_is_its_origins(tmp_path):
     mesh = '<link name="x"><collision><geometry><mesh filename="gone.stl"/></geometry></collision></link>'
     joint = '<joint name="e" type="fixed"><parent link="arm_6"/><child link="x"/></joint>'

@@ -37,6 +37,20 @@ def test_a_job_for_every_object(cli, meshes, quick, tmp_path):
     assert sum(shard["rows"] for shard in json.loads(info.out)) == 12
 
 
+def test_what_is_left_out_of_a_folder_is_told(cli, meshes, quick):
+    for name in ("b.STEP", "a.dae", "paint.mtl", "paint.png"):
+        (meshes / name).touch()
+    base = ("generate", "-p", quick, "-n", 4, "--device", "cpu", "--dry-run", "--object")
+    assert cli(*base, "meshes").err.splitlines() == [
+        "warning: meshes: left out a.dae, b.STEP; accepted: .obj, .stl, .ply, .off, .glb, .gltf, .3mf"
+    ]
+    (meshes / "more").mkdir()
+    (meshes / "tiny.obj").rename(meshes / "more" / "small.obj")
+    assert "left out the meshes in more/; 'meshes/**/*' takes them too" in cli(*base, "meshes").err
+    taken = cli(*base, "meshes/**/*")
+    assert ("allegro-small" in taken.out, taken.err) == (True, "")
+
+
 def test_revisions_of_a_known_hand_are_called_as_their_files(cli, quick, tmp_path):
     for name in ("rev_a", "rev_b"):
         shutil.copy(find_hand("allegro").urdf, tmp_path / f"{name}.urdf")

@@ -117,19 +117,14 @@ def _structure(urdf: Urdf, name: str, locked: dict[str, float]) -> FingerStructu
 
 
 def _shared_joint(structure: FingerStructure) -> str | None:
-    """The actuated joint that moves most tips of one group, when each of these has other joints left.
-
-    Two fingers stay together when one of them would be left with a single drive and there is another finger to oppose
-    them: a finger of one drive meets few objects.
-    """
+    """The actuated joint that moves most tips of one group, when each of these has other joints left."""
     best, most = None, 1
     group = structure.tree.body_group
     for g in range(structure.tree.groups):
         members = [d for tip, d in structure.drives.items() if group[tip] == g]
         for name in structure.tree.joint_names:
             moved = [d for d in members if name in d]
-            pair = len(moved) == len(members) == 2 and structure.tree.groups > 1 and min(map(len, moved)) == 2
-            if len(moved) > most and all(len(d) > 1 for d in moved) and not pair:
+            if len(moved) > most and all(len(d) > 1 for d in moved):
                 best, most = name, len(moved)
     return best
 

@@ -13,7 +13,7 @@ from support.urdfs import BAR, PHALANX, fingers, gripper, rods
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.draft import draft_spec
-from lgrasp.hand.drafting.finger_structure import held_value
+from lgrasp.hand.drafting.finger_structure import finger_structure, held_value
 from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import sample_bodies
@@ -210,6 +210,13 @@ def test_joints_are_held_inside_their_limits():
         assert joint.lower <= held_value(joint, share) <= joint.upper
     assert held_value(joint) == 0.0
     assert held_value(replace(joint, lower=0.2)) == round((0.2 + np.pi) / 2, 4)
+
+
+def test_two_fingers_behind_a_spread_joint_are_two_where_a_third_opposes_them():
+    structure = finger_structure(read_urdf(ROOT / "hands" / "barrett" / "hand.urdf"), "drafted")
+    assert structure.locked == ("finger_1_prox_joint",)
+    assert [sorted(drives) for drives in structure.drives.values()] == [[f"finger_{n}_med_joint"] for n in (1, 2, 3)]
+    assert structure.tree.groups == 3
 
 
 @pytest.mark.usefixtures("no_spaces")
