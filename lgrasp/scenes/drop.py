@@ -1,6 +1,7 @@
 """Objects dropped on a table, simulated by MuJoCo until they lie still."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +43,7 @@ def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.rand
         PhysicsError: MuJoCo is missing or refuses an object, or the objects never came to rest on the table.
     """
     mujoco, names = import_mujoco(), ", ".join(f"'{solid.name}'" for solid in solids)
+    centers, solids = np.array([solid.center for solid in solids]), [_centred(solid) for solid in solids]
     try:
         model = _model(mujoco, solids, table, params)
     except (ValueError, RuntimeError) as error:
@@ -53,11 +55,17 @@ def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.rand
         seconds = _settle(mujoco, model, data, params)
         pose = data.qpos.reshape(-1, 7).copy()
         if seconds is not None and _on_table(solids, pose, table):
+            pose[:, :3] -= np.einsum("nij,nj->ni", pose_matrix(pose)[:, :3, :3], centers)
             return Settled(np.hstack([pose[:, :3], canonical(pose[:, 3:])]), number, seconds)
     raise PhysicsError(
         f"objects {names} did not come to rest on a table of {table:g} m in {params.tries} tries; "
         "use fewer objects, a larger table or a longer drop"
     )
+
+
+def _centred(solid: Solid) -> Solid:
+    """With its centre of mass at the origin: a frame far off would swing around it, in steps too long for that."""
+    return replace(solid, pieces=tuple(piece - solid.center for piece in solid.pieces), center=np.zeros(3))
 
 
 def _model(mujoco: Any, solids: Sequence[Solid], table: float, params: DropParams) -> Any:
@@ -76,11 +84,11 @@ def _model(mujoco: Any, solids: Sequence[Solid], table: float, params: DropParam
 
 
 def _start(solids: Sequence[Solid], params: DropParams, rng: np.random.Generator) -> np.ndarray:
-    """Random poses (n, 7), each as low as the balls around the objects before it and the table allow."""
+    """Random poses (n, 7) of centred objects, each as low as the balls around those before it and the table allow."""
     pose = np.empty((len(solids), 7))
-    radius = np.array([max(np.linalg.norm(p - s.center, axis=1).max() for p in s.pieces) for s in solids])
+    radius = np.array([max(np.linalg.norm(p, axis=1).max() for p in s.pieces) for s in solids])
     centre = np.empty((len(solids), 3))
-    for k, solid in enumerate(solids):
+    for k in range(len(solids)):
         turn, way = canonical(rng.standard_normal(4)), 2.0 * np.pi * rng.random()
         away = params.radius * np.sqrt(rng.random())
         x, y = away * np.cos(way), away * np.sin(way)
@@ -92,8 +100,7 @@ def _start(solids: Sequence[Solid], params: DropParams, rng: np.random.Generator
             if rest > 0.0:
                 height = max(height, centre[i, 2] + np.sqrt(rest))
         centre[k] = x, y, height
-        pose[k] = 0.0, 0.0, 0.0, *turn
-        pose[k, :3] = centre[k] - pose_matrix(pose[k])[:3, :3] @ solid.center
+        pose[k] = *centre[k], *turn
     return pose
 
 
