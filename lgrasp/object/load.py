@@ -121,9 +121,9 @@ def read_bytes(path: Path, suffixes: Sequence[str], what: str, error: type[Lgras
 
 
 @contextlib.contextmanager
-def quiet_parsers() -> Iterator[None]:
+def quiet_parsers(logger: str = "trimesh") -> Iterator[None]:
     """Keep the parsers of files from warning or logging: whatever matters is checked on their result."""
-    log = logging.getLogger("trimesh")
+    log = logging.getLogger(logger)
     before, log.disabled = log.disabled, True
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
