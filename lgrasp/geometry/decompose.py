@@ -10,6 +10,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -27,6 +29,8 @@ Decompose = Callable[..., list[np.ndarray]]
 _TREE_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "resolution": 1000}
 """CoACD's effort: a tenth of the default's time, pieces hardly worse."""
 
+_LATE = "convex-timeouts"  # kind of what the store keeps of meshes that took too long
+_POLL = 0.2  # [s] between two calls of ``tell``
 
 _made: dict[str, dict[str, np.ndarray] | DecomposeError] = {}  # of this process: links often share a mesh
 
@@ -39,6 +43,11 @@ class _Store(Protocol):
     def store(self, kind: str, key: str, arrays: dict[str, np.ndarray]) -> None: ...
 
 
+class _TimeOutError(DecomposeError):
+    def __init__(self, seconds: float) -> None:
+        super().__init__(f"convex decomposition took longer than {seconds:g} s")
+
+
 def decompose(
     vertices: np.ndarray,
     faces: np.ndarray,
@@ -48,6 +57,8 @@ def decompose(
     timeout: float = 60.0,
     seed: int = 0,
     store: _Store | None = None,
+    what: str = "a mesh",
+    tell: Callable[[str], None] | None = None,
 ) -> list[np.ndarray]:
     """Convex pieces whose union holds a mesh and follows its dents, as vertices (W, 3) [m] each.
 
@@ -57,7 +68,10 @@ def decompose(
         threshold: dents shallower than this [m] may stay filled.
         max_pieces: pieces are merged down to this number, whatever dents that fills.
         timeout: seconds after which the process is ended.
-        store: results are looked up and kept there; failures are not.
+        store: results are looked up and kept there, and that a mesh took longer than this timeout; other failures are
+            not.
+        what: whose mesh it is.
+        tell: called with ``what`` again and again while it is cut; what it raises ends that.
 
     Raises:
         DecomposeError: time-out, crash, or nothing usable came back.
@@ -66,15 +80,20 @@ def decompose(
     faces = np.ascontiguousarray(faces, np.int32)
     parameters = {"threshold": threshold, "max_convex_hull": max_pieces, "seed": seed, **_TREE_SEARCH}
     key = _key(vertices, faces, parameters)
+    late = _key(vertices, faces, parameters | {"timeout": timeout})
     found = store.load("convex", key) if store else None
     if found is None:
-        if key not in _made:
+        if late not in _made:
             try:
-                _made[key] = _run(vertices, faces, parameters, timeout)
+                if store and store.load(_LATE, late):
+                    raise _TimeOutError(timeout)
+                _made[late] = _run(vertices, faces, parameters, timeout, partial(tell, what) if tell else None)
             except DecomposeError as error:
-                _made[key] = error
-        found = _made[key]
+                _made[late] = error
+        found = _made[late]
         if isinstance(found, DecomposeError):
+            if store and isinstance(found, _TimeOutError) and not store.load(_LATE, late):
+                store.store(_LATE, late, {"timeout": np.array(timeout)})
             raise found
         if store:
             store.store("convex", key, found)
@@ -90,7 +109,11 @@ def _key(vertices: np.ndarray, faces: np.ndarray, parameters: dict[str, float]) 
 
 
 def _run(
-    vertices: np.ndarray, faces: np.ndarray, parameters: dict[str, float], timeout: float
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    parameters: dict[str, float],
+    timeout: float,
+    tell: Callable[[], None] | None,
 ) -> dict[str, np.ndarray]:
     """Pieces as ``vertices`` (W, 3) and ``first`` (pieces + 1,), made by this module in another process."""
     task = io.BytesIO()
@@ -106,13 +129,18 @@ def _run(
                 stderr=subprocess.PIPE,
                 env={**os.environ, "PYTHONPATH": where, "OMP_NUM_THREADS": "1"},
             )
-        with helper:
+        with helper, ThreadPoolExecutor(1) as pool:
             try:
-                out, words = helper.communicate(task.getvalue(), timeout)
+                answer = pool.submit(helper.communicate, task.getvalue(), timeout)
+                while not answer.done():
+                    if tell:
+                        tell()
+                    wait([answer], _POLL)
+                out, words = answer.result()
             finally:
                 helper.kill()
     except subprocess.TimeoutExpired:
-        raise DecomposeError(f"convex decomposition took longer than {timeout:g} s") from None
+        raise _TimeOutError(timeout) from None
     except OSError as error:
         raise DecomposeError(f"convex decomposition cannot be started: {error.strerror}") from None
     try:

@@ -67,7 +67,7 @@ class ExportJob(ExportRequest, Job):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         how: dict[str, Any] = {name: getattr(self, name) for name in ("where", "limit", "split", "licence")}
-        how |= {"run_key": self.key(), "cut": self._cut if self.to == "mjcf" else None}
+        how |= {"run_key": self.key(), "cut": partial(self._cut, progress) if self.to == "mjcf" else None}
 
         def advance(done: int, total: int) -> None:
             replace(progress, part=replace(part, rows=total))(done)
@@ -83,12 +83,12 @@ class ExportJob(ExportRequest, Job):
         objects = [code for path in outcome.paths for code in json.loads(path.read_bytes())["objects"]]
         return {"grasps": outcome.rows, "objects": objects, "format": self.to}
 
-    def _cut(self, record: ObjectRecord) -> Sequence[np.ndarray]:
+    def _cut(self, progress: PartProgress, record: ObjectRecord) -> Sequence[np.ndarray]:
         """Convex pieces of an object as the simulation makes them, from the cache; approximations are reported."""
-        from lgrasp.geometry.decompose import decompose
+        from lgrasp.jobs.records import cutter
         from lgrasp.simulate.solid import object_of_record
 
-        solid = object_of_record(record, partial(decompose, store=self.cache))
+        solid = object_of_record(record, cutter(self.cache, self.events, progress))
         for note in solid.notes:
             self.cache.warn(f"object '{record.name}': {note}")
         return solid.pieces

@@ -2,7 +2,7 @@
 
 import json
 import time
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -11,9 +11,9 @@ from pydantic import PrivateAttr
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.errors import ShardError
-from lgrasp.geometry.decompose import decompose
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.grasp.records import HandRecord
+from lgrasp.jobs.records import cutter
 from lgrasp.jobs.requests.shards import ReachRequest
 from lgrasp.jobs.verdicts import VerdictJob
 from lgrasp.reach.arm import Arm, read_arm
@@ -104,7 +104,7 @@ class ReachJob(ReachRequest, VerdictJob):
         from lgrasp.reach.self_collision import ArmSolids, base_pieces
 
         if hand.sha256 not in self._solids:
-            cut = partial(decompose, store=self.cache)
+            cut = cutter(self.cache, self.events)
             self._solids[hand.sha256] = ArmSolids(self.described, base_pieces(hand, cut), cut)
         return self._solids[hand.sha256]
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lgrasp.engine.cache import Cache
-from lgrasp.geometry.decompose import decompose
+from lgrasp.engine.events import Events, PartProgress
+from lgrasp.geometry.decompose import Decompose, decompose
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
@@ -69,10 +70,27 @@ def object_record(
     )
 
 
+def cutter(cache: Cache, events: Events | None = None, progress: PartProgress | None = None) -> Decompose:
+    """:func:`decompose` with a cache.
+
+    Args:
+        events: told whose mesh is being cut.
+        progress: of the part that needs it, which ends if the job is to stop.
+    """
+
+    def tell(what: str) -> None:
+        if events:
+            events.loading(f"convex pieces of {what}")
+        if progress:
+            progress.check()
+
+    return partial(decompose, store=cache, tell=tell)
+
+
 def make_scene(
     cache: Cache, hand: HandModel, objects: Sequence[ObjectRecord], meshes: dict[str, bytes], device: str
 ) -> "Scene":
     """What the simulator is given: the scene of the job's shards; ``meshes`` are the hand's :func:`mesh_blobs`."""
     from lgrasp.simulate.scene import scene_of
 
-    return scene_of(hand_record(hand, meshes), objects, partial(decompose, store=cache), device)
+    return scene_of(hand_record(hand, meshes), objects, cutter(cache), device)

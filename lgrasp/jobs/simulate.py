@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,8 +13,8 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.errors import PhysicsError, ShardError
-from lgrasp.geometry.decompose import decompose
 from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.jobs.records import cutter
 from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
 from lgrasp.jobs.verdicts import VerdictJob
@@ -73,7 +72,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         protocol, device, name = self.protocol, self.device_used.alias, self.protocol.name
         workers = threads(self.workers)
         with ShardReader(part.source) as reader:
-            scene, rows, key = self._scene_of(reader.hand(), reader.objects()), len(reader), self.key_of(reader)
+            scene, rows = self._scene_of(reader.hand(), reader.objects(), progress), len(reader)
+            key = self.key_of(reader)
             kept = KeptVerdicts(self.cache, key, name, largest=_GPU_BLOCK if self._kind() == "gpu" else None)
 
             before = kept.rows
@@ -152,14 +152,16 @@ class SimulateJob(SimulateRequest, VerdictJob):
     def _kind(self) -> str:
         return "cpu" if on_cpu(self.device_used.alias, self.protocol) else "gpu"
 
-    def _scene_of(self, hand: HandRecord, objects: Sequence[ObjectRecord]) -> Scene:
+    def _scene_of(
+        self, hand: HandRecord, objects: Sequence[ObjectRecord], progress: PartProgress | None = None
+    ) -> Scene:
         """What is simulated of a shard: hand and objects cut into convex pieces."""
         alias = self.device_used.alias
         planes = [b"" if record.tables is None else record.tables.tobytes() for record in objects]
         key = (alias, hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
 
         def make() -> Scene:
-            scene = scene_of(hand, objects, partial(decompose, store=self.cache), alias)
+            scene = scene_of(hand, objects, cutter(self.cache, self.events, progress), alias)
             for line in (f"object {solid.name}: {note}" for solid in scene.objects for note in solid.notes):
                 if line not in self._said:
                     self._said.add(line)

@@ -96,7 +96,7 @@ def load_mesh(
     _check_size(label, vertices[used], scale, params)
     vertices, faces = _weld(label, vertices, faces, notes)
     faces = _orient(vertices, faces, notes)
-    vertices, faces = _close_holes(vertices, faces, params.hole_perimeter, notes)
+    vertices, faces = close_holes(vertices, faces, params.hole_perimeter, notes)
     loose = len(open_edges(faces))
     if loose:
         notes.append(f"not watertight ({loose} open edges): inside is decided by winding number")
@@ -122,9 +122,9 @@ def read_bytes(path: Path, suffixes: Sequence[str], what: str, error: type[Lgras
 
 
 @contextlib.contextmanager
-def quiet_parsers() -> Iterator[None]:
+def quiet_parsers(logger: str = "trimesh") -> Iterator[None]:
     """Keep the parsers of files from warning or logging: whatever matters is checked on their result."""
-    log = logging.getLogger("trimesh")
+    log = logging.getLogger(logger)
     before, log.disabled = log.disabled, True
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -291,10 +291,16 @@ def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.nda
     return faces
 
 
-def _close_holes(
+def close_holes(
     vertices: np.ndarray, faces: np.ndarray, perimeter: float, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fill boundary loops up to ``perimeter`` with a fan around their centre."""
+    """Fill boundary loops up to ``perimeter`` [m] with a fan around their centre, and note how many; a boundary that
+    branches stays open.
+
+    Args:
+        vertices: [m], shape (v, 3).
+        faces: vertex indices of consistent winding, shape (f, 3).
+    """
     loose = open_edges(faces)
     follow = {int(b): int(a) for a, b in loose}  # against the faces' own direction
     if not len(loose) or len(follow) < len(loose):  # closed, or a boundary that branches

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import trimesh
@@ -13,6 +14,7 @@ from lgrasp.geometry.decompose import decompose as cut_mesh
 from lgrasp.geometry.hulls import fewer_corners
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.hand.distance import signed_distance
+from lgrasp.object.load import close_holes
 from lgrasp.object.mass import mass_properties
 
 _ALLOWED_DENT = 2.0e-3  # dents shallower than this [m] may stay filled
@@ -77,14 +79,16 @@ def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, devi
     notes = []
     body = mass_properties(mesh.vertices, mesh.faces)
     if not body.solid:
-        notes.append("the mesh is not closed; mass and inertia are those of its convex hull")
+        mesh, filled = _closed(mesh)
+        holes = ": its holes are filled" if filled else ""
+        notes.append(f"the mesh is not closed{holes}; mass and inertia are those of its convex hull")
     pieces = [mesh.vertices[hull.vertices]]
     excess = _excess(mesh, pieces, device)
     if excess > _ALLOWED_DENT:
         failures = []
         for effort in _EFFORTS:
             try:
-                pieces = _cut(mesh, decompose, *effort)
+                pieces = _cut(mesh, partial(decompose, what=f"object '{record.name}'"), *effort)
                 excess = _excess(mesh, pieces, device)
                 break
             except DecomposeError as error:
@@ -101,6 +105,16 @@ def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, devi
         tables=record.tables,
         notes=tuple(notes),
     )
+
+
+def _closed(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
+    """The mesh with its holes filled, and whether there were any that can be.
+
+    Of an open mesh CoACD makes a shell of ten times the faces, which takes minutes to cut.
+    """
+    notes: list[str] = []
+    vertices, faces = close_holes(np.asarray(mesh.vertices), np.asarray(mesh.faces), np.inf, notes)
+    return (trimesh.Trimesh(vertices, faces, process=False), True) if notes else (mesh, False)
 
 
 def _cut(mesh: trimesh.Trimesh, decompose: Decompose, detail: float, dent: float, timeout: float) -> list[np.ndarray]:

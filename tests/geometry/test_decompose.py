@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import ConvexHull
 from support.solids import ELL, YOU, prism
 
@@ -74,6 +75,27 @@ def test_results_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_run", run)
     for a, b in zip(first, decompose(mesh.vertices, mesh.faces), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_what_took_too_long_is_not_tried_again(tmp_path, monkeypatch):
+    """By another process within the same time; with more of it, it is."""
+    mesh, cache = prism(ELL), Cache(tmp_path)
+    with pytest.raises(DecomposeError, match=r"longer than 0\.01 s"):
+        decompose(mesh.vertices, mesh.faces, timeout=0.01, store=cache)
+    monkeypatch.setattr(module, "_made", {})
+    monkeypatch.setattr(module, "_run", lambda *a: {"vertices": mesh.vertices, "first": np.array([0, 12])})
+    with pytest.raises(DecomposeError, match=r"longer than 0\.01 s"):
+        decompose(mesh.vertices, mesh.faces, timeout=0.01, store=cache)
+    assert len(decompose(mesh.vertices, mesh.faces, store=cache)) == 1
+
+
+def test_who_waits_is_told_and_may_stop_it():
+    def tell(what: str) -> None:
+        raise LookupError(what)
+
+    mesh = trimesh.creation.icosphere(subdivisions=5)  # more than a pipe holds
+    with pytest.raises(LookupError, match="a ball"):
+        decompose(mesh.vertices, mesh.faces, what="a ball", tell=tell)
 
 
 LONG = """

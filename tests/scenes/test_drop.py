@@ -42,6 +42,17 @@ def test_at_rest_on_the_table(solids):
     np.testing.assert_allclose(np.linalg.norm(settled.pose[:, 3:], axis=1), 1, atol=1e-9)
 
 
+@pytest.mark.parametrize("away", [5.0, 30.0])
+def test_a_frame_far_from_its_object(away: float):
+    """As that of a part that is cut out of a large scan."""
+    box = trimesh.creation.box(SIDES).apply_translation([0, 0, away])
+    settled = drop([solid(box, "box")], 0.8, DropParams(), np.random.default_rng(4))
+    assert settled.tries == 1
+    points = trimesh.transform_points(box.vertices, pose_matrix(settled.pose)[0])
+    assert abs(points[:, 2].min()) < 1e-3
+    assert np.abs(points[:, :2]).max() < 0.4
+
+
 def test_same_seed_same_poses(solids):
     runs = [drop(solids, 0.8, DropParams(), np.random.default_rng(seed)).pose for seed in (1, 1, 2)]
     np.testing.assert_array_equal(runs[0], runs[1])

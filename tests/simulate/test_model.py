@@ -145,6 +145,20 @@ def test_a_mesh_that_is_not_closed_is_said():
     assert any("not closed" in note for note in solid.notes)
 
 
+def test_holes_are_filled_before_a_mesh_is_cut():
+    """As a shell of walls it would take minutes."""
+    you, given = prism(YOU, 0.02), []
+    you.update_faces(np.arange(len(you.faces)) > 0)
+
+    def cut(vertices: np.ndarray, faces: np.ndarray, **_: Any) -> list[np.ndarray]:
+        given.append(trimesh.Trimesh(vertices, faces))
+        return [vertices]
+
+    object_of_record(mesh_record("you", you), cut)
+    assert given[0].is_watertight
+    assert given[0].volume == pytest.approx(prism(YOU, 0.02).volume, rel=1e-5)
+
+
 @pytest.mark.parametrize("kind", ["fixed", "revolute", "prismatic"])
 def test_what_carries_the_base_does_not_matter(jaws: Jaws, kind: str):
     """The base on a turned mount, or on a joint that is held somewhere: poses and pulls are in the base's frame."""

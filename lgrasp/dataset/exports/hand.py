@@ -13,6 +13,9 @@ from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse, pose_from_matrix
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.urdf import parse_robot
+from lgrasp.object.load import quiet_parsers
+
+_LOG = "yourdfpy.urdf"  # which complains of joints that mimic one that mimics another
 
 
 def hand_files(hand: HandRecord, where: Path) -> dict[str, bytes]:
@@ -84,7 +87,8 @@ class HandFrames:
             for key in ("effort", "velocity"):
                 limit.set(key, limit.get(key, "0"))
         try:
-            self._urdf = yourdfpy.URDF.load(io.BytesIO(etree.tostring(robot)))
+            with quiet_parsers(_LOG):
+                self._urdf = yourdfpy.URDF.load(io.BytesIO(etree.tostring(robot)))
         except Exception as error:  # yourdfpy raises many kinds
             raise ShardError(f"{where}: its URDF is malformed: {type(error).__name__}: {error}") from error
         self.root: str = self._urdf.base_link
@@ -154,5 +158,6 @@ class HandFrames:
 
     def _transform(self, setting: dict[str, float]) -> np.ndarray:
         values = [setting.get(name, 0.0) for name in self._urdf.actuated_joint_names]
-        self._urdf.update_cfg(np.array(values))
+        with quiet_parsers(_LOG):
+            self._urdf.update_cfg(np.array(values))
         return self._urdf.get_transform(self.root, self.base)[None]

@@ -5,7 +5,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,11 +18,11 @@ from lgrasp.engine.folder import Found, shard_path
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.run import Job, run
 from lgrasp.errors import ConfigError, ShardError
-from lgrasp.geometry.decompose import decompose
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.records import cutter
 from lgrasp.jobs.requests.scenes import SceneRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import mesh_hash, object_of_shard
@@ -167,7 +167,7 @@ def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Event
         if not len(columns["q"]):
             cache.warn(f"object {part.record.id} has no grasps; in scenes it is only in the way")
         model = object_of_shard(cache, part.record, device)
-        solid = object_of_record(part.record, partial(decompose, store=cache), device.alias)
+        solid = object_of_record(part.record, cutter(cache, events), device.alias)
         items.append(Item(part.record, solid, upload_object(model, device.alias), **columns))
         digest.update(mesh_hash(part.record).encode())
         for values in columns.values():

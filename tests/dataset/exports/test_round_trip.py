@@ -15,6 +15,7 @@ from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
+from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.object.mass import mass_properties
 
@@ -197,6 +198,27 @@ def test_mujoco_opens_the_grasp(tmp_path, shards, hand):
     check_scenes(mujoco, tmp_path, shard)
 
 
+@pytest.mark.parametrize(("suffix", "kind"), [("glb", "glb"), ("PLY", "ply"), ("stl", "stl_ascii"), ("STL", "stl")])
+def test_mujoco_opens_meshes_of_other_formats(tmp_path, shards, suffix, kind):
+    mujoco = pytest.importorskip("mujoco")
+    part = trimesh.creation.box((0.01, 0.02, 0.03)).apply_translation((0.1, 0, 0)).export(file_type=kind)
+    name, plain = f"package://arm/part.{suffix}", shards.hand("schunk_svh")
+    urdf = plain.urdf.replace(
+        "</link>",
+        f'''<collision name="part"><geometry><mesh filename="{name}"/></geometry>
+        </collision></link>''',
+        1,
+    )
+    part = part.encode() if isinstance(part, str) else part
+    shards.make(tmp_path / "a.h5", replace(plain, urdf=urdf, meshes={name: part, **plain.meshes}), n=1)
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "grasps" / "00000000.xml"))
+    (mesh,) = [k for k in range(model.nmesh) if model.mesh(k).name.startswith("part")]
+    np.testing.assert_allclose(model.mesh_pos[mesh], (0.1, 0, 0), atol=1e-6)
+    (file,) = (tmp_path / "out" / "hand" / "meshes").iterdir()
+    np.testing.assert_allclose(trimesh.load_mesh(file).extents, (0.01, 0.02, 0.03), atol=1e-6)
+
+
 def check_scenes(mujoco, folder: Path, shard) -> None:
     """Links against yourdfpy, objects against the shard, mimic joints and targets, in every scene."""
     shutil.move(folder / "out", folder / "elsewhere")
@@ -258,6 +280,17 @@ def test_a_real_hand_can_be_used_alone(tmp_path, shards):
         f"{name} = " in text
         for name in json.loads((tmp_path / "elsewhere" / "export.json").read_text())["hand"]["mimic"]
     )
+
+
+def test_joints_may_mimic_those_that_mimic(caplog):
+    joint = """<link name="{0}"/><joint name="{0}" type="revolute"><parent link="{1}"/><child link="{0}"/>{2}
+        <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
+    chain = (("b", "a", ""), ("c", "b", '<mimic joint="b" multiplier="2"/>'), ("d", "c", '<mimic joint="c"/>'))
+    urdf = f'<robot name="r"><link name="a"/>{"".join(joint.format(*j) for j in chain)}</robot>'
+    frames = HandFrames(urdf, "c", ("b",), Path("a.h5"))
+    assert frames.all_joints(np.array([[0.1]]))["d"] == pytest.approx(0.2)
+    frames.base_from_root(np.array([[0.1]]))
+    assert not caplog.records  # yourdfpy's
 
 
 @pytest.mark.parametrize("form", ["dexgraspnet", "webdataset", "mjcf"])
