@@ -17,6 +17,8 @@ ANY_CLOSING = 10.0
 """[rad or m]; joints never close by so much."""
 ANY_PENETRATION = 0.03
 """[m]; closing fingers never penetrate more, as it is measured."""
+ANY_SWEEP = 1.0
+"""[m]; closing links never move so far inside an object."""
 
 PROFILES: dict[str, dict[str, float]] = {
     "strict": {},
@@ -97,6 +99,12 @@ class GraspBounds(Params):
         le=ANY_PENETRATION,
         description="Largest penetration of fingers and object two thirds of the way from q_pregrasp to q [m]; "
         "0.03 asks for nothing.",
+    )
+    max_closing_sweep: float = Field(
+        default=ANY_SWEEP,
+        ge=0,
+        le=ANY_SWEEP,
+        description="Farthest that a link moves inside the object from q_pregrasp to q [m]; 1 asks for nothing.",
     )
     min_pregrasp_opening: float = Field(
         default=0.0,

@@ -172,7 +172,7 @@ class Check:
         at, found = self.at, self.found
         postures = {n: wp.empty((m, model.dofs), dtype=wp.float32, device=d) for n in ("q", "q_pregrasp", "q_squeeze")}
         numbers = wp.empty((len(MEASURED), m), dtype=wp.float32, device=d)
-        grown = {"closing_penetration": wp.zeros(m, dtype=wp.float32, device=d)}
+        grown = {n: wp.zeros(m, dtype=wp.float32, device=d) for n in ("closing_penetration", "closing_sweep")}
         none = {"resting": wp.empty(0, dtype=wp.int32, device=d), "approach": wp.empty(0, dtype=wp.vec3, device=d)}
         packed = empty_struct(Packed, d, m, at.contact.shape[1], numbers=numbers, **postures, **grown, **none)
         opened = wp.empty((m, model.groups, 2), dtype=vec_dof, device=d)

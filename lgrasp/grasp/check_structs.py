@@ -84,6 +84,7 @@ class Packed:
     stable_squeeze: wp.array(dtype=wp.float32)  # (m,) [N]
     closing_travel: wp.array(dtype=wp.float32)  # (m,) [rad or m]
     closing_penetration: wp.array(dtype=wp.float32)  # (m,) [m]
+    closing_sweep: wp.array(dtype=wp.float32)  # (m,) [m]
     resting: wp.array(dtype=wp.int32)  # (m,) resting pose of the object; only where there is a table, as the next
     approach: wp.array(dtype=wp.vec3)  # (m,) direction in which the open hand comes, base frame; NaN none
 

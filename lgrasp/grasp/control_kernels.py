@@ -271,8 +271,8 @@ def limit_squeeze(hand: Hand, limits: Limits, row: wp.array(dtype=wp.int32), pac
 def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32), counts_out: wp.array(dtype=wp.int32)):
     """Rows that squeeze the object by less than ``min_squeeze_travel``, or cannot stably with ``min_stable_squeeze``
     (of two contacts: ``min_stable_pinch``), or close by more than ``max_closing_travel``, or through more of the object
-    than ``max_closing_penetration``, or have less than ``min_epsilon``, or a finger that opens by less than
-    ``min_pregrasp_opening``, become none.
+    than ``max_closing_penetration`` or farther than ``max_closing_sweep``, or have less than ``min_epsilon``, or a
+    finger that opens by less than ``min_pregrasp_opening``, become none.
 
     Args:
         row_out: (m,) hand of each row, -1 none.
@@ -293,6 +293,7 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     still = packed.pregrasp_opening[i] < limits.min_pregrasp_opening
     far = packed.closing_travel[i] > limits.max_closing_travel
     through = packed.closing_penetration[i] > limits.max_closing_penetration
+    through = through or packed.closing_sweep[i] > limits.max_closing_sweep
     if limp or soft or still or far or through or packed.epsilon[i] < limits.min_epsilon:
         row_out[i] = -1
         wp.atomic_sub(counts_out, Outcome.KEPT, 1)

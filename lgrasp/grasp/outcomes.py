@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from lgrasp.grasp.bounds import ANY_CLOSING, ANY_PENETRATION, GraspBounds
+from lgrasp.grasp.bounds import ANY_CLOSING, ANY_PENETRATION, ANY_SWEEP, GraspBounds
 from lgrasp.grasp.tables import GraspTable
 
 
@@ -47,7 +47,7 @@ FAILED_BOUNDS = (
     *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
     *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel", "min_stable_squeeze"),
     *("max_closing_travel", "min_epsilon", "min_pregrasp_opening", "min_hold_probability"),
-    "max_closing_penetration",
+    *("max_closing_penetration", "max_closing_sweep"),
 )
 """By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
 way of the open hand to the object clears the table."""
@@ -68,14 +68,14 @@ MEASURED = ("gap", "facing", "fswo", "gswo", "unresisted_load", "penetration")
 METRICS = (
     *("fswo", "gswo", "unresisted_load", "epsilon", "force_closure"),
     *("penetration", "self_penetration", "gap", "normal_error", "pregrasp_opening", "squeeze_travel"),
-    *("squeeze_force", "stable_squeeze", "closing_travel", "closing_penetration"),
+    *("squeeze_force", "stable_squeeze", "closing_travel", "closing_penetration", "closing_sweep"),
 )
 """Columns of the metrics table."""
 
 
 _SQUEEZE_BOUNDS = (
     *("min_squeeze_travel", "max_closing_travel", "min_stable_squeeze", "min_epsilon", "min_pregrasp_opening"),
-    "max_closing_penetration",
+    *("max_closing_penetration", "max_closing_sweep"),
 )
 
 
@@ -83,7 +83,7 @@ def bounds_squeeze(bounds: Any) -> bool:
     """Whether one of _SQUEEZE_BOUNDS asks for something; ``bounds`` as of :func:`failed_squeeze`."""
     least = [bounds.min_squeeze_travel, bounds.min_epsilon, bounds.min_pregrasp_opening]
     least += [bounds.min_stable_squeeze, bounds.min_stable_pinch]
-    through = bounds.max_closing_penetration < ANY_PENETRATION
+    through = bounds.max_closing_penetration < ANY_PENETRATION or bounds.max_closing_sweep < ANY_SWEEP
     return max(least) > 0 or bounds.max_closing_travel < ANY_CLOSING or through
 
 
@@ -102,6 +102,7 @@ def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
         table.metrics["epsilon"] < bounds.min_epsilon,
         table.metrics["pregrasp_opening"] < bounds.min_pregrasp_opening,
         table.metrics["closing_penetration"] > bounds.max_closing_penetration,
+        table.metrics["closing_sweep"] > bounds.max_closing_sweep,
     ]
 
 

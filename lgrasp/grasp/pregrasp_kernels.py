@@ -20,8 +20,10 @@ OPENING_SHARES = wp.constant(5)
 FINGER_TRIES = wp.constant(3 * OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
 _NOT_TOUCHING = wp.constant(1.0e6)  # opening of a hand no finger of which touches
-_CLOSED = wp.constant(2.0 / 3.0)  # of the way from q_pregrasp to q
+_PARTS = wp.constant(9)  # of the way from q_pregrasp to q
+_CLOSED = wp.constant(6)  # of these
 _DEEPEST = wp.constant(ANY_PENETRATION)  # [m]
+_INSIDE = wp.constant(0.15e-3)  # [m] what is deeper does not just touch
 _NEAR = wp.constant(0.002)  # [m] bodies whose samples are farther from the object do not penetrate
 
 
@@ -284,10 +286,11 @@ def measure_closing(
     row: wp.array(dtype=wp.int32),
     packed_out: Packed,
 ):
-    """Deepest penetration [m] of fingers and object two thirds of the straight way from ``q_pregrasp`` to ``q``: a
-    finger that goes through the object pushes it away.
+    """Deepest penetration [m] of fingers and object two thirds of the straight way from ``q_pregrasp`` to ``q``, and
+    how far the middle of a link moves inside the object on that way [m]: a finger that goes through the object pushes
+    it away, however thin that is.
 
-    One thread per (group, row); ``closing_penetration`` grows to the largest.
+    One thread per (group, row); ``closing_penetration`` and ``closing_sweep`` grow to the largest.
 
     Args:
         row: (m,) hand of each row, -1 none.
@@ -304,12 +307,32 @@ def measure_closing(
     if joint_motion(hand, g, x, q) == 0.0:
         return
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    group_forward(hand.kin, g, x + _CLOSED * (q - x), X, hand.kin.joint_first[g])
+    before = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    inside = wp.zeros(shape=(MAX_BODIES,), dtype=wp.int32)
+    swept = wp.zeros(shape=(MAX_BODIES,), dtype=wp.float32)
     T_object = wp.transform_inverse(at.pose[at.of[s]])
     deepest = float(0.0)
-    for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-        T = T_object * X[j]
-        if not body_apart(hand, obj, 1 + j, T, _NEAR):
-            deepest = wp.max(deepest, body_depth(hand, obj, 1 + j, T, _DEEPEST))
+    farthest = float(0.0)
+    for part in range(_PARTS + 1):
+        group_forward(hand.kin, g, x + (float(part) / float(_PARTS)) * (q - x), X, hand.kin.joint_first[g])
+        for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
+            ball = hand.pieces.body_sphere[1 + j]
+            middle = wp.vec3(ball[0], ball[1], ball[2])
+            if inside[j] == 1:
+                swept[j] += wp.length(wp.transform_point(X[j], middle) - wp.transform_point(before[j], middle))
+                farthest = wp.max(farthest, swept[j])
+            before[j] = X[j]
+            inside[j] = 0
+            T = T_object * X[j]
+            if part < _PARTS and not body_apart(hand, obj, 1 + j, T, _NEAR):
+                if part == _CLOSED:
+                    depth = body_depth(hand, obj, 1 + j, T, _DEEPEST)
+                    deepest = wp.max(deepest, depth)
+                else:
+                    depth = body_depth(hand, obj, 1 + j, T, _INSIDE)
+                if depth > _INSIDE:
+                    inside[j] = 1
     if deepest > 0.0:
         wp.atomic_max(packed_out.closing_penetration, i, deepest)
+    if farthest > 0.0:
+        wp.atomic_max(packed_out.closing_sweep, i, farthest)

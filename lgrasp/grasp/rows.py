@@ -21,6 +21,7 @@ METRIC_UNITS = {
     "stable_squeeze": "N",
     "closing_travel": "rad or m",
     "closing_penetration": "m",
+    "closing_sweep": "m",
     "hold_drift": "m",
     "failed_bound": CODE + ", ".join(f"{code} {name}" for code, name in enumerate(FAILED_BOUNDS)),
 }

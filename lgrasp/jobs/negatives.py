@@ -9,7 +9,7 @@ from lgrasp.engine.batch import block_size, run_stages
 from lgrasp.engine.inputs import Inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import shard_context, shard_effort
-from lgrasp.grasp.bounds import ANY_CLOSING, ANY_PENETRATION
+from lgrasp.grasp.bounds import ANY_CLOSING, ANY_PENETRATION, ANY_SWEEP
 from lgrasp.grasp.row_order import RowOrder
 from lgrasp.grasp.tables import GraspTable, join_rows, take_rows, widen_grasps
 from lgrasp.stages.filter.failed import failed_rows
@@ -31,6 +31,7 @@ _LOOSE: dict[str, float] = {
     "min_stable_pinch": 0.0,
     "max_closing_travel": ANY_CLOSING,
     "max_closing_penetration": ANY_PENETRATION,
+    "max_closing_sweep": ANY_SWEEP,
     "min_pregrasp_opening": 0.0,
     "min_table_distance": 0.0,
     "min_self_distance": 0.0,

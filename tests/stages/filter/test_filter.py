@@ -270,18 +270,27 @@ def test_grasps_that_close_through_the_object_are_dropped_where_asked(tables, co
         context, bounds=bounds.changed(pregrasp_distance=0.0, max_penetration=0.01, allowed_penetration=0.01)
     )
     free = run(tables.search, params, shut)[0]
-    closing = free.metrics["closing_penetration"]
-    q = free.q_pregrasp + np.float32(2 / 3) * (free.q - free.q_pregrasp)
+    closing, sweep = free.metrics["closing_penetration"], free.metrics["closing_sweep"]
     contacts = known_contacts(free.contact_links, free.contact_points, free.contact_normals, context.device)
-    there = check_grasps(context.hand, context.object, free.pose, q, contacts, bounds)[0].metrics["penetration"]
-    moved = (free.q != free.q_pregrasp).any(1)
+
+    def depth(share: float) -> np.ndarray:
+        q = free.q_pregrasp + np.float32(share) * (free.q - free.q_pregrasp)
+        return check_grasps(context.hand, context.object, free.pose, q, contacts, bounds)[0].metrics["penetration"]
+
+    way = np.stack([depth(part / 9) for part in range(9)])
+    moved, inside = (free.q != free.q_pregrasp).any(1), (way > 0.15e-3).any(0)
     assert (closing[~moved] == 0).all()
-    assert (closing <= there + 1e-6).all()
-    most = float(np.quantile(closing, 0.7))
-    bound = run(tables.search, params, replace(shut, bounds=shut.bounds.changed(max_closing_penetration=most)))
-    kept = closing <= np.float32(most)
-    assert bound[1]["squeeze"] == (~kept).sum() > 10
-    np.testing.assert_array_equal(free.q[kept], bound[0].q)
+    assert (closing <= way[6] + 1e-6).all()
+    assert (sweep[~moved | ~inside] == 0).all()
+    assert (sweep[moved & (closing > 0.15e-3)] > 0).all()
+    assert (sweep > 0).sum() > 10
+    for name in ("closing_penetration", "closing_sweep"):
+        measured = free.metrics[name]
+        most = float(np.quantile(measured, 0.7))
+        bound = run(tables.search, params, replace(shut, bounds=shut.bounds.changed(**{f"max_{name}": most})))
+        kept = measured <= np.float32(most)
+        assert bound[1]["squeeze"] == (~kept).sum() > 10
+        np.testing.assert_array_equal(free.q[kept], bound[0].q)
 
 
 def test_unresisted_load_is_bounded_where_asked(tables, context, swift):
