@@ -20,8 +20,7 @@ OPENING_SHARES = wp.constant(5)
 FINGER_TRIES = wp.constant(3 * OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
 _NOT_TOUCHING = wp.constant(1.0e6)  # opening of a hand no finger of which touches
-_PARTS = wp.constant(9)  # of the way from q_pregrasp to q
-_CLOSED = wp.constant(6)  # of these
+_PARTS = wp.constant(3)  # of the way from q_pregrasp to q
 _DEEPEST = wp.constant(ANY_PENETRATION)  # [m]
 _INSIDE = wp.constant(0.15e-3)  # [m] what is deeper does not just touch
 _NEAR = wp.constant(0.002)  # [m] bodies whose samples are farther from the object do not penetrate
@@ -287,8 +286,8 @@ def measure_closing(
     packed_out: Packed,
 ):
     """Deepest penetration [m] of fingers and object two thirds of the straight way from ``q_pregrasp`` to ``q``, and
-    how far the middle of a link moves inside the object on that way [m]: a finger that goes through the object pushes
-    it away, however thin that is.
+    how far the middle of a link moves in thirds of that way which it begins inside the object [m], the first left out:
+    a finger that goes through the object pushes it away, however thin that is.
 
     One thread per (group, row); ``closing_penetration`` and ``closing_sweep`` grow to the largest.
 
@@ -313,7 +312,7 @@ def measure_closing(
     T_object = wp.transform_inverse(at.pose[at.of[s]])
     deepest = float(0.0)
     farthest = float(0.0)
-    for part in range(_PARTS + 1):
+    for part in range(1, _PARTS + 1):
         group_forward(hand.kin, g, x + (float(part) / float(_PARTS)) * (q - x), X, hand.kin.joint_first[g])
         for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
             ball = hand.pieces.body_sphere[1 + j]
@@ -325,11 +324,10 @@ def measure_closing(
             inside[j] = 0
             T = T_object * X[j]
             if part < _PARTS and not body_apart(hand, obj, 1 + j, T, _NEAR):
-                if part == _CLOSED:
-                    depth = body_depth(hand, obj, 1 + j, T, _DEEPEST)
+                last = part == _PARTS - 1
+                depth = body_depth(hand, obj, 1 + j, T, wp.where(last, _DEEPEST, _INSIDE))
+                if last:
                     deepest = wp.max(deepest, depth)
-                else:
-                    depth = body_depth(hand, obj, 1 + j, T, _INSIDE)
                 if depth > _INSIDE:
                     inside[j] = 1
     if deepest > 0.0:
