@@ -201,7 +201,7 @@ def _check_size(label: str, vertices: np.ndarray, scale: float, params: ObjectPa
         raise ObjectError(f"{label}: {side}; {accepted}{_remedy(extent, scale)}")
     far = float(np.linalg.norm((vertices.min(axis=0) + vertices.max(axis=0)) / 2))
     if far > _FARTHEST:
-        accepted = f"up to {_FARTHEST:g} m is accepted; move the mesh there"
+        accepted = f"up to {_FARTHEST:g} m is accepted: move it"
         raise ObjectError(f"{label}: the mesh is {far:,.0f} m from the origin of its coordinates; {accepted}")
     spread = vertices - vertices.mean(axis=0)
     axes = np.linalg.eigh(spread.T @ spread)[1]
