@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from lgrasp.choices import EngineName
 from lgrasp.cloud.model import cloud_object
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Loader, object_key
-from lgrasp.geometry.decompose import decompose
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.grasp.records import GraspRows
 from lgrasp.grasp.rows import grasp_rows, press
@@ -24,7 +22,7 @@ from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.model import HandModel
-from lgrasp.jobs.records import hand_record, mesh_blobs, object_record
+from lgrasp.jobs.records import make_scene, mesh_blobs, object_record
 from lgrasp.jobs.shard_inputs import named_hand, palmar_side
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
@@ -39,7 +37,7 @@ from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.runtime.kept import Keeper
 from lgrasp.simulate.protocol import find_protocol
 from lgrasp.simulate.run import check_installed, verdicts
-from lgrasp.simulate.scene import Scene, scene_of
+from lgrasp.simulate.scene import Scene
 from lgrasp.words import number
 
 NOISES = (0.0, 0.002, 0.005, 0.01)
@@ -144,14 +142,14 @@ def _bench_hand(
     source, model = named_hand(cache, hand, at)
     touching, palmar = palmar_side(cache, source, model, at)
     arrays = upload_hand(touching, at.alias)
-    record = hand_record(model, mesh_blobs(source.urdf))
+    meshes = mesh_blobs(source.urdf)
     stand_off = source.spec.stand_off or STAND_OFF
     totals = {name: _Total() for name in planners}
     coarse: list[tuple[ObjectModel, Pose]] = []
     for name in objects:
         mesh, key = object_key(name, 1.0, ObjectParams())
         found = Loader(cache, at.alias).object(mesh, key, 1.0, ObjectParams())
-        scene = scene_of(record, [object_record(found)], partial(decompose, store=cache), at.alias)
+        scene = make_scene(cache, model, [object_record(found)], meshes, at.alias)
         for (on, hands), (noise, params) in planners.items():
             total, target = totals[on, hands], found if noise is None else _cloud(found, noise)
             planner = Planner(arrays, target, stand_off, params, palmar)

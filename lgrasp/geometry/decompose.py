@@ -80,9 +80,9 @@ def decompose(
     faces = np.ascontiguousarray(faces, np.int32)
     parameters = {"threshold": threshold, "max_convex_hull": max_pieces, "seed": seed, **_TREE_SEARCH}
     key = _key(vertices, faces, parameters)
-    late = _key(vertices, faces, parameters | {"timeout": timeout})
     found = store.load("convex", key) if store else None
     if found is None:
+        late = _key(vertices, faces, parameters | {"timeout": timeout})
         if late not in _made:
             try:
                 if store and store.load(_LATE, late):

@@ -38,6 +38,13 @@ def inverse(pose: np.ndarray) -> np.ndarray:
     return np.concatenate([-rotated(q, np.asarray(pose[..., :3], np.float64)), q], -1)
 
 
+def shifted(pose: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Poses of frames that are at ``by`` [m] in those of ``pose``, shape [..., 3], and not turned against them."""
+    out = np.array(pose, np.float64)
+    out[..., :3] += rotated(canonical(out[..., 3:]), by)
+    return out
+
+
 def pose_matrix(pose: np.ndarray) -> np.ndarray:
     """Homogeneous transforms of poses.
 

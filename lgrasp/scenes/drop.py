@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError, short_reason
-from lgrasp.geometry.poses import canonical, pose_matrix, rotated
+from lgrasp.geometry.poses import canonical, pose_matrix, shifted
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.scenes.params import DropParams
 from lgrasp.simulate.builder import add_solid, set_contact, set_options
@@ -51,11 +51,12 @@ def drop(solids: Sequence[Solid], table: float, params: DropParams, rng: np.rand
         mujoco.mj_resetData(model, data)
         data.qpos[:] = _start(solids, params, rng).ravel()
         seconds = _settle(mujoco, model, data, params)
-        pose = data.qpos.reshape(-1, 7).copy()
-        turn = canonical(pose[:, 3:])
-        pose = np.hstack([pose[:, :3] - rotated(turn, np.stack([solid.center for solid in solids])), turn])
-        if seconds is not None and _on_table(solids, pose, table):
-            return Settled(pose, number, seconds)
+        if seconds is None:
+            continue
+        centred = data.qpos.reshape(-1, 7)
+        pose = shifted(centred, -np.stack([solid.center for solid in solids]))
+        if _on_table(solids, pose, table):
+            return Settled(np.hstack([pose[:, :3], canonical(pose[:, 3:])]), number, seconds)
     raise PhysicsError(
         f"objects {names} did not come to rest on a table of {table:g} m in {params.tries} tries; "
         "use fewer objects, a larger table or a longer drop"
@@ -81,7 +82,6 @@ def _start(solids: Sequence[Solid], params: DropParams, rng: np.random.Generator
     """Random poses of centres of mass (n, 7), each as low as the table and the balls around earlier objects allow."""
     pose = np.empty((len(solids), 7))
     radius = np.array([max(np.linalg.norm(p - s.center, axis=1).max() for p in s.pieces) for s in solids])
-    centre = np.empty((len(solids), 3))
     for k in range(len(solids)):
         turn, way = canonical(rng.standard_normal(4)), 2.0 * np.pi * rng.random()
         away = params.radius * np.sqrt(rng.random())
@@ -90,11 +90,10 @@ def _start(solids: Sequence[Solid], params: DropParams, rng: np.random.Generator
         height = radius[k] + params.gap
         for i in range(k):
             reach = radius[k] + radius[i] + params.gap
-            rest = reach**2 - (x - centre[i, 0]) ** 2 - (y - centre[i, 1]) ** 2
+            rest = reach**2 - (x - pose[i, 0]) ** 2 - (y - pose[i, 1]) ** 2
             if rest > 0.0:
-                height = max(height, centre[i, 2] + np.sqrt(rest))
-        centre[k] = x, y, height
-        pose[k] = *centre[k], *turn
+                height = max(height, pose[i, 2] + np.sqrt(rest))
+        pose[k] = x, y, height, *turn
     return pose
 
 

@@ -27,7 +27,7 @@ class MujocoWorld(World):
         self._of_object = np.isin(self._m.geom_bodyid, model.object_body)
 
     def begin(self, q: np.ndarray, poses: np.ndarray) -> None:
-        """Hand at q (K,), objects at poses (O, 7) in the base frame, everything at rest; contacts are found."""
+        """As of :class:`World`; contacts are found."""
         model, lib, data = self._model, self._lib, self.data
         lib.mj_resetData(self._m, data)
         data.qpos[model.joint_address] = model.joint_matrix @ q + model.joint_offset

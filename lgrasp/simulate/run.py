@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError
-from lgrasp.geometry.poses import canonical, rotated
+from lgrasp.geometry.poses import shifted
 from lgrasp.grasp.records import GraspRows
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.runtime.processes import ProcessPool, none_killed
@@ -70,8 +70,7 @@ def group_rows(rows: GraspRows, solids: Sequence[Solid]) -> Iterator[Group]:
         slots = order[found, : len(taken)]
         arrays = {name: getattr(rows, name)[found[:, None], slots] for name in _BY_SLOT}
         centers = np.stack([solids[k].center for k in taken])
-        pose = arrays["object_pose"] = arrays["object_pose"].astype(float)
-        pose[..., :3] += rotated(canonical(pose[..., 3:]), centers)
+        arrays["object_pose"] = shifted(arrays["object_pose"], centers)
         arrays["contact_points"] = arrays["contact_points"] - centers[:, None]
         arrays |= {name: getattr(rows, name)[found] for name in ("q", "q_pregrasp", "q_squeeze", "candidate")}
         arrays["table"] = {name: values[found] for name, values in rows.table.items()}

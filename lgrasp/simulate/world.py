@@ -22,7 +22,7 @@ class World(ABC):
 
     @abstractmethod
     def begin(self, q: np.ndarray, poses: np.ndarray) -> None:
-        """Hand at q (K,), objects at poses (O, 7) in the base frame, everything at rest."""
+        """Hand at q (K,), objects' centres of mass at poses (O, 7) in the base frame, everything at rest."""
 
     @abstractmethod
     def drive(self, targets: np.ndarray) -> None:
@@ -60,7 +60,7 @@ class World(ABC):
 
     @abstractmethod
     def objects(self) -> np.ndarray:
-        """Poses of the objects (O, 7), world frame."""
+        """Poses of the objects' centres of mass (O, 7), world frame."""
 
     @abstractmethod
     def velocities(self) -> np.ndarray:
