@@ -96,7 +96,7 @@ ShardFolder = Annotated[Path, Field(description="Folder of the shards.")]
 class Params(BaseModel):
     """Frozen parameters whose unknown keys fail; keys of the release before are still read, with a notice."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     RENAMED: ClassVar[dict[str, str]] = {}
     """Old key -> the field that it is now called; those of the models that this one builds on are read too."""

@@ -37,13 +37,13 @@ def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator[IO
 
     The bytes go to a unique ``*.tmp`` in the same folder, which is fsynced and renamed; then the folder is fsynced, and
     what killed processes left of the same file is removed. Without ``flush`` none of this is done, which takes longer
-    than all the rest where files are many and small. Missing parent folders are made. On any error the temporary file
-    is removed.
+    than all the rest where files are many and small. Missing parent folders are made. A link stays: what it leads to is
+    replaced. On any error the temporary file is removed.
 
     Raises:
         OutputError: The folder cannot be written or is full.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path) if os.path.islink(path) else path)
     with writing(path):
         temporary = hold_file(path)
         try:

@@ -107,6 +107,17 @@ def test_a_process_that_is_ended_removes_what_it_was_writing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_link_stays(tmp_path):
+    (tmp_path / "store").mkdir()
+    file, link = tmp_path / "store" / "a.h5", tmp_path / "b.h5"
+    file.write_text("old")
+    link.symlink_to(file)
+    write_file(link, "new")
+    assert link.is_symlink()
+    assert file.read_text() == "new"
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
 def test_a_pipe_does_not_hold_up(tmp_path):
     os.mkfifo(tmp_path / "lgrasp.tmp")
     assert remove_leftovers(tmp_path, "*.tmp") == [tmp_path / "lgrasp.tmp"]

@@ -11,13 +11,13 @@ from lgrasp.grasp.hand_files import lacks
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows
 from lgrasp.grasp.schema import CHUNK_ROWS
 from lgrasp.hand.urdf import MOVABLE, parse_robot
+from lgrasp.math.constants import LIMIT_EXCESS
 
 Column = Callable[[str, int, int], np.ndarray]
 """Rows of the whole file by flat name, first row and the row after the last, as :meth:`ShardReader.column`."""
 Require = Callable[[Any, str], None]
 """Called with what is good, shape [n, ...], and the text of the problem if some is not."""
 
-_LIMIT_TOLERANCE = 1e-4  # rad or m
 _UNIT_TOLERANCE = 1e-3  # of quaternion and normal lengths, and of the sum of normal forces
 _HELD = {"q": "q", "q_pregrasp": "q", "q_squeeze": "q_squeeze"}
 """Where joints that a step does not move are: in which control pose of the step before."""
@@ -45,7 +45,7 @@ def are_unit(vectors: np.ndarray) -> np.ndarray:
 
 def accepted_limits(hand: HandRecord) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest joint positions that are accepted, shape [K] each."""
-    return np.asarray(hand.joint_lower) - _LIMIT_TOLERANCE, np.asarray(hand.joint_upper) + _LIMIT_TOLERANCE
+    return np.asarray(hand.joint_lower) - LIMIT_EXCESS, np.asarray(hand.joint_upper) + LIMIT_EXCESS
 
 
 def hand_problems(hand: HandRecord) -> list[str]:

@@ -24,8 +24,8 @@ def extend_shard(
     """Write a copy of a shard, members that the format does not know included, with more ``metrics/NAME``,
     ``physics/NAME`` and statistics.
 
-    Stored bytes are copied as they are, so memory stays bounded. What is there already under a name is replaced. The
-    same input always gives the same bytes.
+    Stored bytes are copied as they are, so memory stays bounded. What is there already under a name is replaced, of
+    verdicts all columns of the same protocol. The same input always gives the same bytes.
 
     Args:
         source: A shard that conforms; damage would be copied along.
@@ -50,13 +50,20 @@ def extend_shard(
         for name, values in columns.items():
             if values.shape[:1] != (n,) or (values.ndim > 1 and name.startswith("metrics/")):
                 raise ShardError(f"{source}: {name} has shape {values.shape}, must have {n} rows")
-        _copy(old, file, {f"grasps/{name}" for name in columns})
+        _copy(old, file, {f"grasps/{name}" for name in (*columns, *_same_verdicts(old["grasps"], columns))})
         for name, values in sorted(columns.items()):
             dataset = create_rows(file, name, values.shape, values.dtype, texts[name])
             if n:
                 dataset[...] = values
         file["statistics"].attrs.update(dict(statistics or {}))
         finish(file)
+
+
+def _same_verdicts(rows: h5py.Group, columns: Mapping[str, np.ndarray]) -> list[str]:
+    """Columns ``physics/NAME`` of the same protocols as some that are replaced."""
+    texts = {f"physics/{name}": dataset.attrs.get("protocol") for name, dataset in rows.get("physics", {}).items()}
+    replaced = {texts[name] for name in columns if name in texts}
+    return [name for name, text in texts.items() if text in replaced]
 
 
 def _copy(old: h5py.Group, new: h5py.Group, leave_out: set[str]) -> None:

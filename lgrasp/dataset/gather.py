@@ -106,7 +106,8 @@ def _rows_of(reader: ShardReader) -> Any:
     return (key, header.shard_index, *reader.object_ids) if isinstance(key, str) and header.shard_index >= 0 else None
 
 
-def _rank(path: Path) -> tuple[bool, int]:
-    """Larger for the rows as they were generated, and for more verdicts."""
+def _rank(path: Path) -> tuple[bool, int, int]:
+    """Larger for the rows as they were generated, for more rows, and for more verdicts."""
     with ShardReader(path) as reader:
-        return MADE_FROM not in reader.statistics, sum(name.startswith("physics/") for name in reader.columns)
+        verdicts = sum(name.startswith("physics/") for name in reader.columns)
+        return MADE_FROM not in reader.statistics, len(reader), verdicts

@@ -81,7 +81,11 @@ class Listing:
         return self._describe()
 
     def ask(self, present: Mapping[int, int]) -> None:
-        """List what is asked, with the rows of the parts that are there, by number; say that this process works."""
+        """List what is asked, with the rows of the parts that are there, by number; say that this process works.
+
+        Raises:
+            OutputError: another run is making files of the same names.
+        """
         if self.folders:
             remove_leftovers(self._root, TEMPORARY)
             self._mark.enter_context(working_on(self._root, self.run.run_key))
@@ -101,7 +105,8 @@ class Listing:
                 shards.append(shard)
             run = self.run.model_copy(update={"shards": shards})
             making = {part.file.name for part in own if part.number not in there}
-            update_manifest(folder, partial(Manifest.ask, run=run, making=making))
+            busy = {worker.run_key for worker in workers(self._root)} - {run.run_key}
+            update_manifest(folder, partial(Manifest.ask, run=run, making=making, busy=busy))
 
     def record(self, part: Part, rows: int, *, written: bool) -> None:
         """List a part that was made; ``written``: its file is on disk, else there was nothing to write."""

@@ -245,8 +245,11 @@ def run(
     job._events = events = events or Events()
     start = time.perf_counter()
     array, device, every, parts, present = todo = look(job, array=array, resume=resume)
+    absent = [part for part in parts if not os.path.lexists(part.file)]
     job.clean(parts)
     outcome = JobOutcome(job, device, parts, present, seconds={"kernels": prepare(job, todo)})
+    if resume and absent:  # another run may have made files in the meantime
+        job.present(absent)
     events.started(parts, present)
     begin = time.perf_counter()
     try:
@@ -387,7 +390,7 @@ def _make_parts(
                     writing.append((part, made, writer.submit(write, part, made)))
                 else:
                     manifests.record(part, 0, written=False)
-            if job.asks and rows == 0:  # nor will the next parts give any
+            if job.asks and rows == 0:  # the next parts would hardly give any either
                 for other in outcome.parts[outcome.parts.index(part) + 1 :]:
                     if other.number not in present:
                         manifests.record(other, 0, written=False)

@@ -18,6 +18,14 @@ def open_edges(faces: np.ndarray) -> np.ndarray:
     return edges[(balance[group] != 0.0) & ((balance[group] > 0.0) == forward)]
 
 
+def bodies(faces: np.ndarray) -> np.ndarray:
+    """Number of the body that each face is of, shape (f,): faces that vertices join, from 0 on."""
+    from trimesh.graph import connected_component_labels
+
+    label = connected_component_labels(faces[:, [0, 1, 1, 2]].reshape(-1, 2), int(faces.max()) + 1)
+    return np.unique(label[faces[:, 0]], return_inverse=True)[1]
+
+
 def face_neighbours(faces: np.ndarray) -> np.ndarray:
     """Face across the edge from corner e to e + 1, shape (f, 3), int32; -1 across an open edge.
 

@@ -107,7 +107,7 @@ def joint_lead(hand: Hand, k: wp.int32, T: wp.transform, p: wp.vec3, f: wp.vec3,
     """How far ahead position control of joint k's dof must aim to press with force f [N] on point p of a body that it
     moves (body frame T of the joint) [rad or m]."""
     lead = wp.dot(point_column(hand.kin, k, T, p), f) / stiffness
-    return wp.where(hand.kin.joint_prismatic[k] == 1, lead * SLIDING_ARM * SLIDING_ARM, lead)
+    return wp.where(hand.kin.drive_prismatic[k] == 1, lead * SLIDING_ARM * SLIDING_ARM, lead)
 
 
 @wp.func

@@ -60,7 +60,7 @@ def _finger_gives(
                 a = b - 1 - j0
                 while a >= 0:
                     d = hand.kin.joint_dof[j0 + a]
-                    arm = wp.where(hand.kin.joint_prismatic[j0 + a] == 1, SLIDING_ARM, 1.0)
+                    arm = wp.where(hand.kin.drive_prismatic[j0 + a] == 1, SLIDING_ARM, 1.0)
                     J[d] = J[d] + point_column(hand.kin, j0 + a, at.body[s, j0 + a], p) * arm
                     a = hand.kin.joint_parent[j0 + a]
                 for d in range(dofs):

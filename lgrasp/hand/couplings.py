@@ -52,6 +52,27 @@ def find_drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
     return drives
 
 
+def _narrowed(
+    drives: list[Joint], followers: list[Joint], drive: dict[str, tuple[str, float, float]]
+) -> dict[str, tuple[float, float]]:
+    limits = {j.name: (j.lower, j.upper) for j in drives}
+    for j in followers:
+        source, mult, offset = drive[j.name]
+        if j.mimic is None or mult == 0.0:
+            continue
+        a, b = sorted(((j.lower - offset) / mult, (j.upper - offset) / mult))
+        limits[source] = max(limits[source][0], a), min(limits[source][1], b)
+    return limits
+
+
+def free_joints(urdf: Urdf) -> dict[str, Joint]:
+    """Joints that follow none, by name, with the limits that those leave them that follow them."""
+    movable = [j for j in urdf.joints if j.movable]
+    free = {j.name: j for j in movable if j.mimic is None}
+    limits = _narrowed(list(free.values()), movable, find_drives(urdf))
+    return {n: replace(j, lower=limits[n][0], upper=limits[n][1]) for n, j in free.items()}
+
+
 def drive_limits(
     actuated: list[Joint], moving: list[Joint], drive: dict[str, tuple[str, float, float]], spec: HandSpec
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -60,13 +81,7 @@ def drive_limits(
     Raises:
         HandError: nothing is left of them.
     """
-    limits = {j.name: (j.lower, j.upper) for j in actuated}
-    for j in moving:
-        source, mult, offset = drive[j.name]
-        if j.mimic is None or mult == 0.0:
-            continue
-        a, b = sorted(((j.lower - offset) / mult, (j.upper - offset) / mult))
-        limits[source] = max(limits[source][0], a), min(limits[source][1], b)
+    limits = _narrowed(actuated, moving, drive)
     for name, (lower, upper) in limits.items():
         if lower >= upper:
             raise HandError(

@@ -11,6 +11,7 @@ from lgrasp.errors import HandError
 from lgrasp.hand.couplings import drive_limits, find_drives, with_mimic
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.urdf import Joint, Urdf
+from lgrasp.math.constants import LIMIT_EXCESS
 from lgrasp.math.limits import DOF_SIZES, MAX_DOFS
 
 MAX_SETTINGS = 32
@@ -40,6 +41,7 @@ class Tree:
     joint_offset: np.ndarray  # (J,)
     joint_axis: np.ndarray  # (J, 3)
     joint_prismatic: np.ndarray  # (J,) i32
+    drive_prismatic: np.ndarray  # (J,) i32: of the actuated joint that each follows, or is
     T_parent_joint: np.ndarray  # (J, 4, 4)
     dof_index: np.ndarray  # (D,) i32: column of q that group-ordered dof d is
     dof_free: np.ndarray  # (G,) i32: dofs that a group moves itself; they come first, shared ones after
@@ -119,9 +121,9 @@ class Tree:
 
     @cached_property
     def column_sliding(self) -> np.ndarray:
-        """(K,) i32: 1 for actuated joints that slide, as those do that follow them."""
+        """(K,) i32: 1 for actuated joints that slide."""
         out = np.zeros(len(self.joint_names), np.int32)
-        out[self.joint_column] = self.joint_prismatic
+        out[self.joint_column] = self.drive_prismatic
         return out
 
     def path(self, body: int) -> list[int]:
@@ -164,6 +166,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     _check_names(urdf, spec, base)
     drive = find_drives(urdf)
     fixed = {n: m * spec.locked[source] + b for n, (source, m, b) in drive.items() if source in spec.locked}
+    _check_fixed(urdf, spec, fixed)
     # each link: the movable joint it rides on (None = static) and its pose in that joint's moving frame (or the root)
     rides: dict[str, tuple[str | None, np.ndarray]] = {urdf.root: (None, np.eye(4))}
     parent_of: dict[str, str | None] = {}
@@ -231,6 +234,7 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         joint_offset=np.array([drive[j.name][2] for j in order], np.float32),
         joint_axis=np.array([j.axis for j in order], np.float32),
         joint_prismatic=np.array([j.prismatic for j in order], np.int32),
+        drive_prismatic=np.array([actuated[column[drive[j.name][0]]].prismatic for j in order], np.int32),
         T_parent_joint=np.array([pose_of[j.name] for j in order]),
         dof_index=np.array(dof_index, np.int32),
         dof_free=np.array(dof_free, np.int32),
@@ -251,15 +255,12 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
 
 
 def _check_names(urdf: Urdf, spec: HandSpec, base: str) -> None:
-    """The joints and links that the rules name exist, and locked joints may be where they are held."""
+    """The joints and links that the rules name exist."""
     movable = {j.name: j for j in urdf.joints if j.movable}
-    for name, value in spec.locked.items():
+    for name in spec.locked:
         joint = movable.get(name)
         if joint is None:
             raise HandError(f"hand '{spec.name}': locked joint '{name}' is not a movable joint of {urdf.path}")
-        if not joint.lower - 1e-6 <= value <= joint.upper + 1e-6:
-            limits = f"[{joint.lower}, {joint.upper}]"
-            raise HandError(f"hand '{spec.name}': locked joint '{name}' = {value} is outside its limits {limits}")
         if joint.mimic is not None:
             source = f"follows joint '{joint.mimic[0]}'; lock that one instead"
             raise HandError(f"hand '{spec.name}': joint '{name}' is locked but {source}")
@@ -271,6 +272,18 @@ def _check_names(urdf: Urdf, spec: HandSpec, base: str) -> None:
             raise HandError(f"hand '{spec.name}': '{link}' (static_links or fingers) is not a link of {urdf.path}")
     if base not in urdf.links:
         raise HandError(f"hand '{spec.name}': base_link '{base}' is not a link of {urdf.path}")
+
+
+def _check_fixed(urdf: Urdf, spec: HandSpec, fixed: dict[str, float]) -> None:
+    """Locked joints, and those that follow them, may be where they are held."""
+    for joint in urdf.joints:
+        value = fixed.get(joint.name, joint.lower)
+        if not joint.lower - LIMIT_EXCESS <= value <= joint.upper + LIMIT_EXCESS:
+            which = "locked joint" if joint.name in spec.locked else "joint that follows a locked one,"
+            raise HandError(
+                f"hand '{spec.name}': {which} '{joint.name}' = {value:g} is outside its limits "
+                f"[{joint.lower:g}, {joint.upper:g}]"
+            )
 
 
 def _own_limits(joints: list[Joint]) -> np.ndarray:

@@ -143,7 +143,7 @@ def check_robot(path: Path, tree: etree._Element, raw: bytes, mesh_dirs: Sequenc
 
 
 def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
-    """The <robot> element of a URDF and its text, both without what other tools add under prefixes never declared.
+    """The <robot> element of a URDF and its text in UTF-8, without what other tools add under prefixes never declared.
 
     Raises:
         HandError: not XML, a DOCTYPE, or another root element.
@@ -155,7 +155,10 @@ def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
         if tree is None:
             raise HandError(f"URDF {path} is not XML: {short_reason(error)}") from None
         raw = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
-    if tree.getroottree().docinfo.doctype:
+    about = tree.getroottree().docinfo
+    if (about.encoding or "UTF-8").upper() not in ("UTF-8", "ASCII", "US-ASCII"):
+        raw = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+    if about.doctype:
         raise HandError(f"URDF {path} declares a DOCTYPE; entity declarations are not accepted, remove them")
     if tree.tag == "mujoco":
         raise HandError(f"URDF {path} is MJCF: make a hand of it with 'lgrasp hands add {path}', and use that")

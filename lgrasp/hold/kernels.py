@@ -205,15 +205,12 @@ def _describe(hand: Hand, w: Scratch):
         while hand.kin.dof_first[g + 1] <= k:
             g += 1
         w.group[k] = g
-        stiff = float(1.0)
-        for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-            if hand.kin.joint_dof[j] == k - hand.kin.dof_first[g] and hand.kin.joint_prismatic[j] == 1:
-                stiff = 1.0 / (SLIDING_ARM * SLIDING_ARM)
+        arm = wp.where(hand.kin.column_sliding[hand.kin.dof_index[k]] == 1, SLIDING_ARM, 1.0)
         copies = float(0.0)
         for o in range(dofs):
             if hand.kin.dof_index[o] == hand.kin.dof_index[k]:
                 copies += 1.0
-        w.scale[k] = stiff / copies
+        w.scale[k] = 1.0 / (arm * arm * copies)
         w.effort[k] = hand.kin.column_effort[hand.kin.dof_index[k]] / copies
 
 

@@ -38,7 +38,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
     """Adds verdicts of a physics simulation to shards, in place or to copies."""
 
     command: ClassVar[str] = "simulate"
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)
@@ -190,12 +190,13 @@ def summary(done: Sequence[Simulated], protocol: Protocol) -> list[dict[str, Any
     off a table, ``on_table`` and ``pushed``. ``share``: of the draws of a row that hold, mean; ``mass``, ``friction``,
     ``stiffness`` are None if they are drawn.
     """
-    groups: dict[tuple[str, tuple[str, ...]], list[Simulated]] = {}
+    groups: dict[Any, list[Simulated]] = {}
     for one in done:
         sets, which = np.unique(one.object_index, axis=0, return_inverse=True)
         for number in np.lexsort([*sets.T[::-1], (sets >= 0).sum(1)]):
             part = _part(one, which.ravel() == number)
-            groups.setdefault((one.hand, tuple(solid.name for solid in part.objects)), []).append(part)
+            alike = one.hand, *((solid.name, solid.volume) for solid in part.objects)
+            groups.setdefault(alike, []).append(part)
     return [_entry(group, protocol) for group in groups.values()]
 
 

@@ -298,7 +298,7 @@ class RowChecks:
                 numbers |= dict(zip(names, force_errors(points, inward, forces), strict=True))
             if used.any() and epsilon:
                 obj = self.shard.objects[self.index[row, o]]
-                numbers["epsilon"] = -ferrari_canny(points, inward, obj.centre_of_mass, obj.radius)
+                numbers["epsilon"] = -ferrari_canny(points, inward, obj.centre_of_mass, obj.radius, self.shard.friction)
             for name, value in numbers.items():
                 found.setdefault(name, []).append(value)
         for name, each in found.items():

@@ -15,10 +15,8 @@ SAME_POSE = 1e-6
 class Repeats(NamedTuple):
     """Rows of a dataset that an earlier row of the same hand and objects comes close to."""
 
-    combined: int
-    """Within one scaled distance, by the root of the summed squares."""
-    largest: int
-    """Within one scaled distance, by the largest ratio."""
+    near: int
+    """Within the distances of near-duplicates."""
     distinct_poses: int
     """Rows whose object poses differ from all earlier ones by more than 1e-6."""
 
@@ -34,8 +32,8 @@ def _neighbours(keys: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         yield i[j < i], j[j < i]
 
 
-def near_duplicates(poses: np.ndarray, q: np.ndarray, joint_scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with an earlier row within one scaled distance: by root of the summed squares, by the largest ratio.
+def near_duplicates(poses: np.ndarray, q: np.ndarray, joint_scale: np.ndarray) -> np.ndarray:
+    """Rows (n,) bool with an earlier row within all distances of near-duplicates.
 
     Args:
         poses: object poses, shape [n, O, 7], NaN where absent (the same objects in every row).
@@ -46,15 +44,14 @@ def near_duplicates(poses: np.ndarray, q: np.ndarray, joint_scale: np.ndarray) -
     t, r, s = poses[..., :3] / DUPLICATE_T, poses[..., 3:], q / joint_scale
     r = r / np.linalg.norm(r, axis=-1, keepdims=True)
     spread = np.argsort(-s.std(axis=0))[:5]
-    combined, largest = np.zeros(len(q), bool), np.zeros(len(q), bool)
+    found = np.zeros(len(q), bool)
     for i, j in _neighbours(np.hstack([t[:, 0], s[:, spread]])):
         dt = np.linalg.norm(t[i] - t[j], axis=-1).max(axis=1)
         cosine = np.abs(np.einsum("nok,nok->no", r[i], r[j])).clip(max=1.0)
         dr = (2.0 * np.arccos(cosine)).max(axis=1) / DUPLICATE_R
         dq = np.abs(s[i] - s[j]).max(axis=1)
-        combined[i[dt**2 + dr**2 + dq**2 <= 1.0]] = True
-        largest[i[np.maximum(np.maximum(dt, dr), dq) <= 1.0]] = True
-    return combined, largest
+        found[i[np.maximum(np.maximum(dt, dr), dq) <= 1.0]] = True
+    return found
 
 
 def distinct_poses(poses: np.ndarray) -> int:
@@ -80,10 +77,10 @@ def count_repeats(shards: Sequence[JudgedShard]) -> Repeats:
             groups.setdefault(key, []).append((pose[m], q[m].astype(float)))
             kinds = [s.hand.movable[n].kind for n in s.joint_names]
             scales[key] = np.array([DUPLICATE_T if kind == "prismatic" else DUPLICATE_Q for kind in kinds])
-    found = np.zeros(3, int)
+    found = np.zeros(2, int)
     for key, members in groups.items():
         pose, q = (np.concatenate(x) for x in zip(*members, strict=True))
         sign = np.where(pose[..., 3:4] < 0, -1.0, 1.0)
         flat = np.concatenate([pose[..., :3], sign * pose[..., 3:]], axis=-1).reshape(len(pose), -1)
-        found += [*(mask.sum() for mask in near_duplicates(pose, q, scales[key])), distinct_poses(flat)]
+        found += [near_duplicates(pose, q, scales[key]).sum(), distinct_poses(flat)]
     return Repeats(*found.tolist())

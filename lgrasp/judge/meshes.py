@@ -18,6 +18,7 @@ DIRECTIONS = 16  # lines through each point where the mesh is open
 CELLS = 48  # along the longest side of the grid that tells inside from outside away from the surface
 FEW = 256  # points that are decided without the grid
 FEATURE = 5e-5  # normals of all faces this close to the closest point are admissible [m]
+MASS_POINTS = 200_000  # in the box of overlapping bodies
 OUTSIDE, INSIDE, CROSSED = range(3)
 
 _ICO = trimesh.creation.icosahedron().vertices
@@ -289,7 +290,8 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
 
 
 def mass_centre(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Centre of mass at uniform density, (3,): of the mesh if it is closed, else of its convex hull.
+    """Centre of mass at uniform density, (3,): of the mesh if it is closed, else of its convex hull; where bodies
+    overlap, of random points inside any.
 
     Raises:
         ValueError: not closed, and flat.
@@ -297,6 +299,11 @@ def mass_centre(mesh: trimesh.Trimesh) -> np.ndarray:
     n = len(mesh.vertices)
     there, back = (np.sort(mesh.edges @ np.array(weights, np.int64)) for weights in ((n, 1), (1, n)))
     if np.array_equal(there, back) and mesh.volume > 1e-12 * mesh.extents.max() ** 3:
+        if mesh.body_count > 1:
+            points = np.random.default_rng(7).uniform(*mesh.bounds, (MASS_POINTS, 3))
+            winding = Crossings(mesh.vertices, mesh.faces, Rotation.identity()).count(points)[0]
+            if winding.max() > 1.5:
+                return np.asarray(points[winding > 0.5].mean(axis=0))
         return np.asarray(mesh.center_mass)
     try:
         return np.asarray(mesh.convex_hull.center_mass)

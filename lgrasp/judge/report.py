@@ -132,9 +132,8 @@ class Report(JudgedRows):
             **{name: getattr(self, name) for name in same},
             "shards": [s.to_dict() for s in self.shards],
             "stored_metrics": self.metrics,
-            "near_duplicates": self.repeats.combined,
-            "near_duplicates_max": self.repeats.largest,
-            "near_duplicate_share": self.repeats.combined / max(self.total_rows, 1),
+            "near_duplicates": self.repeats.near,
+            "near_duplicate_share": self.repeats.near / max(self.total_rows, 1),
             "distinct_object_poses": self.repeats.distinct_poses,
             "self_penetration_pairs": self.self_pairs,
         }
@@ -162,10 +161,10 @@ class Report(JudgedRows):
             yield line
         whole, repeats = self.counts(), self.repeats
         judged = f"{whole['valid_rows']} of {whole['rows']} judged rows ({100 * self.valid_share:.2f} %)"
-        share = 100 * repeats.combined / max(self.total_rows, 1)
+        share = 100 * repeats.near / max(self.total_rows, 1)
         yield ""
         yield f"strictly valid   {judged}, {self.total_rows} rows in the input"
-        yield f"near-duplicates  {repeats.combined} ({share:.2f} %), by largest ratio {repeats.largest}"
+        yield f"near-duplicates  {repeats.near} ({share:.2f} %)"
         yield f"object poses     {repeats.distinct_poses} distinct"
         yield f"time             {self.seconds:.1f} s, reading and preparing {self.seconds_load:.1f} s"
         yield from _table("recomputed", self.distributions)

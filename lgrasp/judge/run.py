@@ -97,18 +97,18 @@ def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], obj
 
 
 METRICS = {
-    "epsilon": "epsilon",
-    "fswo|frictionless": "residual_frictionless",
+    "epsilon(_exact)?": "epsilon",
+    "fswo|(residual_)?frictionless": "residual_frictionless",
     "gswo|residual": "residual",
-    "self.*penetration|penetration.*self": "self_penetration_mm",
-    "(object_object|between).*penetration|penetration.*(object_object|between)": "object_object_mm",
-    "penetration": "penetration_mm",
-    "gap": "contact_link_mm",
-    "normal": "normal_deg",
-    "links": "links_in_contact",
-    "^(contacts|contact_count|num_contacts)$": "contacts",
+    "self_penetration": "self_penetration_mm",
+    "object_object_penetration|penetration_between_objects": "object_object_mm",
+    "(max_)?penetration(_depth)?": "penetration_mm",
+    "(contact_)?gap": "contact_link_mm",
+    "normals?(_(error|angle))?": "normal_deg",
+    "links(_in_contact)?|contact_links": "links_in_contact",
+    "contacts|contact_count|num_contacts": "contacts",
 }
-"""What the name of a stored metric holds, and the number that it is compared with; the first that fits counts."""
+"""Names of stored metrics, and the number that each is compared with."""
 
 
 def metric_errors(shard: JudgedShard, rows: np.ndarray, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -116,7 +116,7 @@ def metric_errors(shard: JudgedShard, rows: np.ndarray, values: dict[str, np.nda
     out = {}
     for name, (data, unit) in shard.metrics.items():
         stored, given = np.asarray(data, float)[rows], unit.strip().lower()
-        value = next((value for form, value in METRICS.items() if re.search(form, name.lower())), None)
+        value = next((value for form, value in METRICS.items() if re.fullmatch(form, name.lower())), None)
         if value is None:
             continue
         if value == "normal_deg":

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import trimesh
 
-from lgrasp.judge.bounds import LIMIT_EXCESS, JudgeError
+from lgrasp.judge.bounds import LIMIT_EXCESS, MU, JudgeError
 from lgrasp.judge.collision import POSTURES, JudgedHand, JudgedObject
 from lgrasp.judge.meshes import clean_mesh, load_mesh
 from lgrasp.judge.steer import Asked, JudgedRegions, read_asked
@@ -64,6 +64,7 @@ class JudgedShard:
     metrics: dict[str, tuple[np.ndarray, str]]
     kept_invalid: np.ndarray  # (n,), rows that the file itself calls invalid
     claims: dict[str, str]
+    friction: float  # that the stored epsilon is of
     notes: list[str]
     asked: Asked | None
 
@@ -220,8 +221,11 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
     metrics = {k: (column, _text(g[f"metrics/{k}"].attrs.get("unit", ""))) for k, column in columns.items()}
     claims = {k: _text(f.attrs[k]) for k in ("pipeline", "lgrasp_version") if k in f.attrs}
     told = json.loads(_text(f.attrs.get("config", "{}")))
+    friction = MU
     if isinstance(told, dict) and isinstance(told.get("bounds"), dict):
         claims["profile"] = str(told["bounds"].get("profile"))
+        given = told["bounds"].get("friction")
+        friction = given if isinstance(given, float) and 0.0 < given <= 10.0 else MU
     return JudgedShard(
         path=path,
         hand=hand,
@@ -239,6 +243,7 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         metrics=metrics,
         kept_invalid=columns["valid"] == 0 if "valid" in columns else np.zeros(sizes["N"], bool),
         claims=claims,
+        friction=friction,
         asked=read_asked(told),
         notes=_notes(hand, joint_names, f["hand"], {k: obj for k, (obj, _) in objects.items()}),
     )

@@ -44,9 +44,9 @@ def force_errors(points: np.ndarray, inward: np.ndarray, forces: np.ndarray) -> 
     return balance, abs(float(push.sum()) - 1.0), float((side - MU * push).max())
 
 
-def ferrari_canny(points: np.ndarray, inward: np.ndarray, centre: np.ndarray, radius: float) -> float:
+def ferrari_canny(points: np.ndarray, inward: np.ndarray, centre: np.ndarray, radius: float, mu: float = MU) -> float:
     """Radius of the largest origin ball in the hull of the cone edges' wrenches (L1), 0 without force closure."""
-    forces = cone_forces(inward)
+    forces = cone_forces(inward, mu)
     arms = np.repeat(points - centre, CONE_EDGES, axis=0)
     f = forces.reshape(-1, 3)
     try:

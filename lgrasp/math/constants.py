@@ -18,6 +18,8 @@ DRIVE_STIFFNESS = 5.0
 """Position control that squeezes are meant for and simulations begin with [N m/rad]."""
 SLIDING_ARM = 0.1
 """A sliding joint is as stiff as a revolute one at this arm [m]."""
+LIMIT_EXCESS = 1.0e-4
+"""Of joints beyond their limits, which files round [rad or m]."""
 LEAST_MASS = 1.0e-3
 """Of a link that is simulated, where its URDF gives less [kg]."""
 LEAST_INERTIA = 1.0e-7

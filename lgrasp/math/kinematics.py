@@ -29,6 +29,7 @@ class Kinematics:
     joint_offset: wp.array(dtype=wp.float32)  # (J,) [rad or m]
     joint_axis: wp.array(dtype=wp.vec3)  # (J,) unit, in the joint's frame
     joint_prismatic: wp.array(dtype=wp.int32)  # (J,) 1: slides
+    drive_prismatic: wp.array(dtype=wp.int32)  # (J,) 1: its drive slides
     joint_origin: wp.array(dtype=wp.transform)  # (J,) T_parent_joint at coordinate 0 [m]
     dof_lower: wp.array(dtype=wp.float32)  # (D,) [rad or m]
     dof_upper: wp.array(dtype=wp.float32)  # (D,) [rad or m]

@@ -17,7 +17,7 @@ import trimesh
 from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError, short_reason
-from lgrasp.geometry.edges import open_edges
+from lgrasp.geometry.edges import bodies, open_edges
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.params import ObjectParams
@@ -271,9 +271,7 @@ def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.nda
             if turned:
                 notes.append(f"turned {turned} faces to a consistent winding")
             faces = np.asarray(mesh.faces, np.int64)
-    edges = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    label = trimesh.graph.connected_component_labels(edges, len(vertices))[faces[:, 0]]
-    body = np.unique(label, return_inverse=True)[1]
+    body = bodies(faces)
     count = int(body.max()) + 1
     corners = vertices[faces] - vertices.mean(axis=0)
     volume = np.bincount(body, np.linalg.det(corners) / 6.0, count)

@@ -7,10 +7,11 @@ import trimesh
 from scipy.spatial import QhullError
 
 from lgrasp.errors import ObjectError
-from lgrasp.geometry.edges import open_edges
+from lgrasp.geometry.edges import bodies, open_edges
 
 _FLAT = 1e-6  # of the spreads of points along their main axes, the least over the largest
 _LEAST_VOLUME = 1e-12  # over the cubed largest side; a closed mesh of less bounds nothing
+_OVERLAP = 1e-4  # of the volume; what is less than that is not told from rounding
 
 
 class MassProperties(NamedTuple):
@@ -27,7 +28,8 @@ class MassProperties(NamedTuple):
 
 
 def mass_properties(vertices: np.ndarray, faces: np.ndarray) -> MassProperties:
-    """Mass properties of what a mesh bounds; of its convex hull if it is open, bounds nothing, or has no faces.
+    """Mass properties of what a mesh bounds; of its convex hull if it is open, bounds nothing, or has no faces. Where
+    bodies of a closed mesh overlap, there is one body.
 
     Args:
         vertices: [m], shape (v, 3); those at one place are one.
@@ -39,7 +41,7 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray) -> MassProperties:
     points, faces = np.asarray(vertices, float), np.asarray(faces)
     origin = 0.5 * (points.min(axis=0) + points.max(axis=0))
     points = points - origin
-    found = _solid(points, faces) if len(faces) and _closed(points, faces) else None
+    found = _solid_mesh(points, faces) if len(faces) else None
     closed = found is not None
     if found is None:
         found = _solid_hull(points[np.unique(faces)] if len(faces) else points)
@@ -49,10 +51,39 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray) -> MassProperties:
     return MassProperties(volume, origin + center, inertia, closed)
 
 
-def _closed(points: np.ndarray, faces: np.ndarray) -> bool:
-    """True if every directed edge is matched by its opposite."""
-    joined = np.unique(points, axis=0, return_inverse=True)[1].ravel()[faces]
-    return not len(open_edges(joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]))
+def _solid_mesh(points: np.ndarray, faces: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """:func:`_solid` of a mesh, of which no part counts twice; None if an edge is not matched by its opposite."""
+    places, joined = np.unique(points, axis=0, return_inverse=True)
+    joined = joined.ravel()[faces]
+    joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
+    if not len(joined) or len(open_edges(joined)):
+        return None
+    found = _solid(points, faces)
+    union = _union(places, joined)
+    if found is None or union is None or union.volume > (1.0 - _OVERLAP) * found[0]:
+        return found
+    return _solid(np.asarray(union.vertices), np.asarray(union.faces))
+
+
+def _union(points: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh | None:
+    """All bodies of a closed mesh as one; None if their boxes are apart, or they have no union."""
+    body = bodies(faces)
+    shells = [trimesh.Trimesh(points, faces[body == k], process=False) for k in range(int(body.max()) + 1)]
+    low, high = (np.array([shell.bounds[end] for shell in shells]) for end in (0, 1))
+    volume = np.array([shell.volume for shell in shells])
+    solid = np.flatnonzero(volume > 0.0)
+    meets = ((low[solid, None] < high[solid]) & (low[solid] < high[solid, None])).all(axis=-1)
+    if meets.sum() == len(solid):  # with itself alone
+        return None
+    parts = {k: [shells[k]] for k in solid}
+    for k in np.flatnonzero(volume < 0.0):  # a cavity of the smallest that is about it
+        about = [o for o in solid if (low[o] < low[k]).all() and (high[o] > high[k]).all()]
+        if about:
+            parts[min(about, key=volume.__getitem__)].append(shells[k])
+    try:
+        return trimesh.boolean.union([trimesh.util.concatenate(each) for each in parts.values()], engine="manifold")
+    except (ValueError, RuntimeError):
+        return None
 
 
 def _solid_hull(points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:

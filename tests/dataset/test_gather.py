@@ -15,8 +15,8 @@ from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import MADE_FROM
 
 
-def write(path, index, run="a", **statistics):
-    shard = sample_shard(3, shard_index=index)
+def write(path, index, run="a", rows=3, **statistics):
+    shard = sample_shard(rows, shard_index=index)
     shard = replace(shard, header=replace(shard.header, config={"run_key": run}), statistics=statistics)
     write_shard(path, shard)
     return path
@@ -65,3 +65,11 @@ def test_the_same_rows_count_once(tmp_path, said):
     assert [shard.path for shard in gather(tmp_path / "top")] == [source, other]
     assert said == [f"1 of 3 shards repeat rows of others and are left out, first {refined} (rows of {source})"]
     assert [shard.path for shard in gather([refined, tmp_path / "top" / "x"])] == [refined, source, other]
+
+
+def test_of_fewer_and_more_rows_of_a_run_the_more_count(tmp_path):
+    """As they are generated: what was made from rows may have more of them only if some were made anew."""
+    few, many = (write(tmp_path / "top" / name / "0.h5", 0, rows=rows) for name, rows in (("a", 3), ("b", 5)))
+    write(tmp_path / "top" / "c" / "0.h5", 0, rows=6, **{MADE_FROM: "some job"})
+    assert [shard.path for shard in gather(tmp_path / "top")] == [many]
+    assert [shard.path for shard in gather([few, tmp_path / "top"])] == [few, many]

@@ -195,6 +195,41 @@ def test_missing_changed_and_foreign_shards_in_a_merge(tmp_path, said):
     assert "1 of the shards there are not listed, first found.h5" in said[-1]
 
 
+@pytest.mark.parametrize("resume", [True, False])
+def test_a_run_in_a_folder_where_another_is_at_work(tmp_path, resume):
+    """The later one ends before it takes a file, though none was there when it began."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    class Slow(SampleJob):
+        def make(self, part, progress):
+            begun.set()
+            assert go_on.wait(60)
+            return super().make(part, progress)
+
+    class Later(SampleJob):
+        def load(self, events, missing):
+            assert begun.wait(60)
+
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(run, Slow(out=tmp_path))
+        with pytest.raises(OutputError, match=r"toy-cup-00000.h5 is being made by another run; wait for it, or choose"):
+            run(Later(out=tmp_path, seed=1), resume=resume)
+        go_on.set()
+        assert len(first.result().written) == 3
+    assert [(r["seed"], len(r["shards"])) for r in document(tmp_path)["runs"]] == [(0, 3)]
+    assert differences(tmp_path) == ([], {}, [], 3)
+
+
+def test_a_run_whose_files_came_while_it_loaded(tmp_path):
+    class Later(SampleJob):
+        def load(self, events, missing):
+            run(SampleJob(out=tmp_path))
+
+    with pytest.raises(OutputError, match=r"toy-cup-00000.h5 belongs to another run"):
+        run(Later(out=tmp_path, seed=1))
+    assert [r["seed"] for r in document(tmp_path)["runs"]] == [0]
+
+
 def test_tasks_that_write_at_once(tmp_path):
     """Nothing that one of four tasks lists is lost."""
     whole, out = tmp_path / "whole", tmp_path / "out"

@@ -153,6 +153,10 @@ def test_couplings_to_a_locked_joint_are_locked(couples):
         ({"mimic": {"k": {"joint": "x"}}}, "mimic names 'x', not a movable joint"),
         ({"mimic": {"l": {"joint": "j"}}}, "mimic couples 'l' to 1 x 'j', but .* couples it to 2 x 'k'"),
         ({"locked": {"l": 0.1}}, "'l' is locked but follows joint 'k'; lock that one"),
+        (
+            {"locked": {"k": 0.9}, "mimic": {"m": {"joint": "l", "multiplier": -2.0}}},
+            r"joint that follows a locked one, 'm' = -3.6 is outside its limits \[-3, 3\]",
+        ),
     ],
 )
 def test_bad_couplings(couples, more, message):

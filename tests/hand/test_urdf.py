@@ -152,6 +152,17 @@ def test_binary_garbage_and_odd_encodings(tmp_path):
         assert_refused(path, "")
 
 
+@pytest.mark.parametrize("encoding", ["iso-8859-1", "utf-16"])
+def test_other_encodings_become_utf_8(tmp_path, encoding):
+    path = tmp_path / "hand.urdf"
+    text = robot(A, link("glied_ä"), joint("j", "a", "glied_ä")).replace("?>", f' encoding="{encoding}"?>', 1)
+    path.write_bytes(text.encode(encoding))
+    urdf = read_urdf(path)
+    assert list(urdf.links) == ["a", "glied_ä"]
+    path.write_bytes(urdf.text.encode())
+    assert read_urdf(path).links.keys() == urdf.links.keys()
+
+
 def test_file_that_is_none(tmp_path):
     assert_refused(tmp_path / "hand.urdf", "cannot be read")
     assert_refused(tmp_path, "cannot be read")

@@ -24,7 +24,7 @@ def test_strictly_valid(run, name):
     report = judge(path, mesh=find_object(name))
     assert report.rows == 30
     assert report.valid_share == 1.0, report
-    assert report.repeats.largest == 0
+    assert report.repeats.near == 0
     bounds = {
         "fswo": 2e-3,
         "gswo (stored normals)": 0.014,  # the filter's bound and this stay below the strict one

@@ -183,6 +183,33 @@ def test_in_place(cli, grasps, tmp_path):
     assert sorted(path.name for path in grasps.iterdir()) == [first.name, second.name, "manifest.json"]
 
 
+def test_verdicts_that_are_replaced_go_as_a_whole(cli, grasps, tmp_path):
+    """With those that only the numbers before gave; protocols of like names stay."""
+    config = tmp_path / "sim.yaml"
+
+    def simulate_with(**protocol):
+        config.write_text(json.dumps({"job": "simulate", "shards": [str(grasps)], "protocol": protocol}))
+        assert cli("run", config, "--overwrite").code == 0
+
+    simulate_with(name="mine", draws={"count": 2})
+    simulate_with(name="mine_too", draws={"count": 2})
+    simulate_with(name="mine", friction=0.3)
+    physics = set(read_shard(min(grasps.glob("*.h5"))).grasps.physics)
+    assert {"mine_holds", "mine_too_holds", "mine_too_share"} <= physics
+    assert "mine_share" not in physics
+
+
+def test_objects_of_one_name_are_told_apart(cli, grasps, tmp_path):
+    """A mug of another size has another mass."""
+    (path, _) = sorted(grasps.glob("*.h5"))
+    shard = read_shard(path)
+    small = [replace(o, vertices=0.5 * o.vertices) for o in shard.objects]
+    write_shard(path, replace(shard, objects=small))
+    data = json.loads(cli("simulate", grasps, "--protocol", "gravity6", "--json", "-").out)
+    assert len({entry["object"] for entry in data["results"]}) == 1
+    assert len({entry["mass"] for entry in data["results"]}) == 2
+
+
 def test_killed_while_it_replaces_a_shard(cli, grasps, tmp_path, monkeypatch):
     """The list says nothing of the size of a file that is being replaced, so that nobody calls it damaged."""
     write_manifest(grasps)

@@ -13,6 +13,8 @@ from support.kinematics import link_poses
 from lgrasp.hand.arrays import body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.tree import build_tree
+from lgrasp.hand.urdf import read_urdf
 
 JAWS = """<robot name="jaws">
   <link name="base"><collision><geometry><box size="0.1 0.1 0.02"/></geometry></collision></link>
@@ -118,6 +120,24 @@ def check_jacobian(model: HandModel, device: str) -> None:
         slope = (T_of[1] - T_of[-1]) / (2 * h)
         # central differences: h^2 / 6 of the third derivative, and float32 positions over 2 h
         np.testing.assert_allclose(J[:, :, column], slope, atol=5e-5)
+
+
+@pytest.mark.parametrize(("drive", "follower"), [("prismatic", "revolute"), ("revolute", "prismatic")])
+def test_a_drive_is_as_stiff_as_its_own_joint(tmp_path, drive, follower):
+    """Whatever follows it: a rack moves a gear, a gear a rack."""
+    ends = [(drive, "a", "base", ""), (follower, "b", "base", '<mimic joint="a" multiplier="0.5"/>')]
+    shape = '<collision><geometry><box size="0.02 0.02 0.06"/></geometry></collision>'
+    text = f'<robot name="r"><link name="base">{shape}</link>' + "".join(
+        f'<link name="on_{name}">{shape}</link><joint name="{name}" type="{kind}"><parent link="{up}"/>'
+        f'<child link="on_{name}"/><limit lower="0" upper="1"/>{more}</joint>'
+        for kind, name, up, more in ends
+    )
+    (tmp_path / "r.urdf").write_text(text + "</robot>")
+    tree = build_tree(read_urdf(tmp_path / "r.urdf"), minimal_spec("r", ["on_a"]))
+    slides = int(drive == "prismatic")
+    assert tree.column_sliding.tolist() == [slides]
+    assert tree.drive_prismatic.tolist() == [slides, slides]
+    assert sorted(tree.joint_prismatic) == [0, 1]
 
 
 def test_prismatic_mimic_and_continuous_joints(jaws, device):

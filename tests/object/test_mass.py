@@ -81,6 +81,34 @@ def test_two_cubes_that_share_an_edge_are_solid():
     np.testing.assert_allclose(mass_centre(mesh), found.center, atol=1e-9)
 
 
+def test_bodies_that_overlap_count_once():
+    beam = trimesh.creation.box((0.04, 0.02, 0.02))
+    block = trimesh.creation.box((0.02, 0.04, 0.03)).apply_translation([0.005, 0.012, 0.0])
+    mesh = trimesh.util.concatenate([beam, block])
+    found = mass_properties(mesh.vertices, mesh.faces)
+    one, other, both = 1.6e-5, 2.4e-5, 0.02 * 0.018 * 0.02
+    volume = one + other - both
+    center = (other * np.array([0.005, 0.012, 0.0]) - both * np.array([0.005, 0.001, 0.0])) / volume
+    assert found.solid
+    assert found.volume == pytest.approx(volume, rel=1e-5)
+    np.testing.assert_allclose(found.center, center, atol=1e-7)
+    np.testing.assert_allclose(
+        found.inertia, trimesh.boolean.union([beam, block]).moment_inertia, rtol=1e-4, atol=1e-15
+    )
+    np.testing.assert_allclose(mass_centre(mesh), center, atol=1e-4)
+
+
+def test_what_fills_a_cavity_counts():
+    """Ice in a shell: their boxes overlap, they do not."""
+    shell, cavity, ice = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.04, 0.03, 0.02))
+    cavity.invert()
+    mesh = trimesh.util.concatenate([shell, cavity, ice.apply_translation([0.005, 0.0, 0.0])])
+    found = mass_properties(mesh.vertices, mesh.faces)
+    assert found.volume == pytest.approx(mesh.volume)
+    np.testing.assert_allclose(found.center, mesh.center_mass, atol=1e-9)
+    np.testing.assert_allclose(mass_centre(mesh), mesh.center_mass, atol=1e-9)
+
+
 def test_flat_is_refused():
     with pytest.raises(ObjectError, match="flat"):
         mass_properties(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), np.array([[0, 1, 2]]))

@@ -9,6 +9,7 @@ import numpy as np
 
 from lgrasp.errors import HandError
 from lgrasp.hand.build import build_hand
+from lgrasp.hand.couplings import free_joints
 from lgrasp.hand.drafting.contact_survey import ContactSurvey, Side, survey_contacts
 from lgrasp.hand.drafting.finger_structure import (
     FingerStructure,
@@ -107,7 +108,7 @@ def _with_shared(urdf: Urdf, survey: ContactSurvey, spec: HandSpec, decided: lis
     """Locked joints that move several fingers take a few values instead, those aside that the palm rides on."""
     spread = [n for n in spec.locked if n not in survey.structure.carrying]
     spread = [n for n in spread if _freed(urdf, spec, {n: (spec.locked[n],)}) is not None]
-    by_name = {j.name: j for j in urdf.joints}
+    by_name = free_joints(urdf)
     count = _SHARED_VALUES.get(len(spread), 0)
     shared = {n: _around(spec.locked[n], by_name[n].lower, by_name[n].upper, count) for n in spread}
     free = _freed(urdf, spec, shared) if count else None
@@ -157,7 +158,7 @@ def _best_survey(urdf: Urdf, structure: FingerStructure, name: str, jaws: tuple[
     An arm that is in the way of the fingers is held elsewhere. Values at which links overlap that other values part are
     taken last: such grasps are invalid.
     """
-    by_name = {j.name: j for j in urdf.joints}
+    by_name = free_joints(urdf)
     base = {n: held_value(by_name[n]) for n in structure.locked}
     carrying = structure.locked if jaws is not None else structure.carrying
     spread = [n for n in structure.locked if n not in carrying]

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from lgrasp.errors import HandError
+from lgrasp.hand.couplings import free_joints
 from lgrasp.hand.links import joints_above
 from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.hand.tree import Tree, build_tree
@@ -74,7 +75,7 @@ def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerS
     Raises:
         HandError: no collision geometry on moving links, limits in degrees, or more fingers than are supported.
     """
-    by_name = {j.name: j for j in urdf.joints}
+    by_name = free_joints(urdf)
     if not any(urdf.links.values()):
         raise HandError(
             f"URDF {urdf.path} has no collision geometry; 'lgrasp hands add {urdf.path}' takes the visual "

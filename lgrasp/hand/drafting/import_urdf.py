@@ -30,7 +30,7 @@ from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
 from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, read_robot
 from lgrasp.paths import cache_dir, data_dirs, user_dir
 
-_DRAFT_VERSION = 5
+_DRAFT_VERSION = 6
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
 _MOST_OTHERS = 30  # files that are asked for couplings
