@@ -262,15 +262,17 @@ def inner_spheres(piece: Piece, count: int, rng: np.random.Generator) -> np.ndar
 
 
 def surface_samples(mesh: trimesh.Trimesh, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """Points (n, 3) on a mesh no farther apart than about ``spacing`` [m], along its sharp edges and at its sharp
-    vertices too: they poke deepest between others."""
+    """Points (n, 3) on a mesh no farther apart than about ``spacing`` [m], along its sharp edges half as far, and at its
+    sharp vertices: they poke deepest between others."""
     area = float(mesh.area)
     n = int(np.clip(4 * area / spacing**2, 64, 20000))
     points = trimesh.sample.sample_surface(mesh, n, seed=int(rng.integers(2**31)))[0]
-    creases = sample_creases(mesh.vertices, mesh.faces, _CREASE_ANGLE, spacing)[0]
+    creases = sample_creases(mesh.vertices, mesh.faces, _CREASE_ANGLE, spacing / 2)[0]
+    creases = creases[one_per_cell(creases, spacing / 4)]
     hull = mesh.convex_hull
     order = np.argsort(-hull.vertex_defects, kind="stable")
     sharp = hull.vertices[order]
     corners = sharp[one_per_cell(sharp, _SHARP_CELL)[:_MOST_SHARP]]
-    points = np.vstack([creases, points])
-    return np.vstack([points[one_per_cell(points, spacing)], corners])
+    both = np.vstack([creases, points])
+    kept = one_per_cell(both, spacing)
+    return np.vstack([creases, both[kept[kept >= len(creases)]], corners])

@@ -18,7 +18,7 @@ def test_samples_lie_along_the_edges_of_a_box():
     for axis in range(3):
         edge = np.tile(half, (200, 1))
         edge[:, axis] = np.linspace(-half[axis], half[axis], 200)
-        assert KDTree(on_edge).query(edge)[0].max() <= SPACING
+        assert KDTree(on_edge).query(edge)[0].max() <= SPACING / 2
 
 
 def test_units_of_collada_files_count(tmp_path):
