@@ -20,7 +20,7 @@ from lgrasp.hold.run import METRICS
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.metrics import MetricsJob
 
-ROWS = 20
+ROWS = 40
 
 
 class Watch(Events):
