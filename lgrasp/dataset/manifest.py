@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -99,7 +99,7 @@ class Manifest(_Listed):
         """What is known of files that may be a run's, by name."""
         return {s.file: s for r in self.runs if r.run_key in (run.run_key, "") for s in r.shards}
 
-    def ask(self, run: ListedRun, making: Collection[str], busy: Collection[str] = ()) -> None:
+    def ask(self, run: ListedRun, making: Collection[str], busy: Mapping[str, str] | None = None) -> None:
         """Take up what a run is asked for now: what was made stays so unless more rows are asked.
 
         Files of other runs are this run's from now on; those of this run that are not asked any more stay while they
@@ -107,14 +107,17 @@ class Manifest(_Listed):
 
         Args:
             making: Files that are going to be made.
-            busy: Keys of other runs that processes work on; what these were asked for stays theirs.
+            busy: Hosts of processes that work on other runs, by key; what these were asked for stays theirs.
 
         Raises:
             OutputError: A file is one of those.
         """
-        theirs = {s.file for r in self.runs if r.run_key in busy for s in r.shards}
-        if taken := sorted(theirs.intersection(shard.file for shard in run.shards)):
-            raise OutputError(f"{taken[0]} is being made by another run; wait for it, or choose another --out")
+        busy = busy or {}
+        theirs = {s.file: busy[r.run_key] for r in self.runs if r.run_key in busy for s in r.shards}
+        if taken := sorted(theirs.keys() & {shard.file for shard in run.shards}):
+            host = theirs[taken[0]]
+            dead = f"; if it was killed on {host}, remove manifest.*.running.tmp" if host != platform.node() else ""
+            raise OutputError(f"{taken[0]} is being made by another run; wait for it, or choose another --out{dead}")
         known = {name: shard for name, shard in self.entries(run).items() if name not in making}
         asked = [_carried(shard, known.get(shard.file)) for shard in run.shards]
         names = {shard.file for shard in asked}

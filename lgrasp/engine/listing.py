@@ -105,7 +105,7 @@ class Listing:
                 shards.append(shard)
             run = self.run.model_copy(update={"shards": shards})
             making = {part.file.name for part in own if part.number not in there}
-            busy = {worker.run_key for worker in workers(self._root)} - {run.run_key}
+            busy = {w.run_key: w.host for w in workers(self._root) if w.run_key != run.run_key}
             update_manifest(folder, partial(Manifest.ask, run=run, making=making, busy=busy))
 
     def record(self, part: Part, rows: int, *, written: bool) -> None:
