@@ -262,8 +262,8 @@ def inner_spheres(piece: Piece, count: int, rng: np.random.Generator) -> np.ndar
 
 
 def surface_samples(mesh: trimesh.Trimesh, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """Points (n, 3) on a mesh no farther apart than about ``spacing`` [m], along its sharp edges half as far, and at its
-    sharp vertices: they poke deepest between others."""
+    """Points (n, 3) on a mesh no farther apart than about ``spacing`` [m], along its sharp edges half as far, and at
+    its sharp vertices: they poke deepest between others."""
     area = float(mesh.area)
     n = int(np.clip(4 * area / spacing**2, 64, 20000))
     points = trimesh.sample.sample_surface(mesh, n, seed=int(rng.integers(2**31)))[0]
