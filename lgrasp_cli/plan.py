@@ -117,7 +117,7 @@ def refine(
 
 
 def _show_refined(data: dict[str, Any]) -> list[Block]:
-    names = ("hand", "object", "rows", "refined", "valid before", "valid")
+    names = ("hand", "object", "rows", "refined", "valid before", "valid", "failed")
     rows = [
         (one["hand"], one["object"], *(f"{one[n.replace(' ', '_')]:,}" for n in names[2:])) for one in data["results"]
     ]

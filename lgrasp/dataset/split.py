@@ -188,7 +188,13 @@ def _first(reader: ShardReader) -> np.ndarray:
 def _pose_numbers(reader: ShardReader, seed: int) -> np.ndarray:
     """A random number for the object of each row and the pose that it was made from, shape [N], uint64."""
     objects = np.array([*(_number(f"{seed}/{sha256}") for _, sha256, _ in reader.object_keys), 0], np.uint64)
-    return mixed(objects[_first(reader)] + mixed(pose_numbers(reader.column("candidate"), reader.header.config)))
+    candidate = reader.column("candidate")
+    if "sequence/parent" in reader.columns:  # the pose of a chain is that of its first object
+        root, parent = np.arange(len(candidate)), reader.column("sequence/parent")
+        while len(later := np.flatnonzero(parent[root] >= 0)):
+            root[later] = parent[root[later]]
+        candidate = candidate[root]
+    return mixed(objects[_first(reader)] + mixed(pose_numbers(candidate, reader.header.config)))
 
 
 def _number(text: str) -> int:

@@ -110,13 +110,6 @@ class Workers:
 
 
 @wp.func
-def _share(rng: wp.uint32, spread: Spread, draw: wp.int32, number: wp.int32):
-    """Where in its range a number is: the strata of a grasp's draws, all moved on by as much, round and round."""
-    u = spread.strata[draw, number] + wp.randf(rng)
-    return u - wp.floor(u)
-
-
-@wp.func
 def _between(ends: wp.vec2, share: wp.float32):
     return ends[0] + (ends[1] - ends[0]) * share
 
@@ -287,8 +280,10 @@ def _begin(course: Course, spread: Spread, grasps: TriedGrasps, trials: Trials, 
     row = trials.row[i]
     rng = wp.rand_init(spread.seed, grasps.number[row])
     u = vec_numbers()
-    for k in range(DRAWN_NUMBERS):
-        u[k] = _share(rng, spread, trials.draw[i], k)
+    for k in range(DRAWN_NUMBERS):  # a function would get a copy of rng
+        # the strata of a grasp's draws, all moved on by as much, round and round
+        u[k] = spread.strata[trials.draw[i], k] + wp.randf(rng)
+        u[k] = u[k] - wp.floor(u[k])
     m = Material()
     m.friction = _between(spread.friction, u[0])
     m.torsion = _between(spread.torsion, u[1])

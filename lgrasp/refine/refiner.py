@@ -2,7 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -71,16 +71,14 @@ class Refiner(nn.Module):
 
     Three modes: :meth:`forward` is fast, keeps no graph and computes in float32 (:mod:`lgrasp.refine.descent`);
     :meth:`unrolled` can be differentiated by the poses that it is given; :meth:`energy` is E* itself, as a loss. What
-    becomes of a sample does not depend on the others.
+    becomes of a sample does not depend on the others. It stays on its device and of its type, whatever a module that
+    holds it is moved to.
 
     Args:
         hand: any hand; coupled joints move with their drive.
         target: an object, or a :class:`Target` with surroundings.
         surface: the hand's points; default: :func:`hand_surface`.
     """
-
-    lower: torch.Tensor
-    upper: torch.Tensor
 
     def __init__(
         self,
@@ -106,12 +104,15 @@ class Refiner(nn.Module):
         self._sum = float(surface.weight.sum())
         palmar = surface.weight.reshape(-1) > 0
         self._palmar = torch.as_tensor(palmar.nonzero()[0], device=device)
-        self.register_buffer("lower", put(hand.tree.joint_lower), persistent=False)
-        self.register_buffer("upper", put(hand.tree.joint_upper), persistent=False)
+        self.lower, self.upper = put(hand.tree.joint_lower), put(hand.tree.joint_upper)
         q = put(hand.tree.joint_open)[None]
         R, t = self._bodies(q)
         x = (R[0, self._block] @ self._points.mT).mT + t[0, self._block, None]
         self._middle = x.reshape(-1, 3)[self._palmar].mean(0)  # of the palmar side, base frame
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is on a device, for copies; they make it anew."""
+        return self.__dict__ | {"_descent": None}
 
     def forward(
         self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, rounds: int | None = None, first: int = 0

@@ -167,4 +167,4 @@ def _excess(mesh: trimesh.Trimesh, pieces: list[np.ndarray], device: str) -> flo
         shell = trimesh.Trimesh(hull.points, hull.simplices, process=False)
         count = int(np.clip(shell.area / 4.0e-6, 200, 5000))
         points.append(trimesh.sample.sample_surface(shell, count, seed=0)[0])
-    return max(0.0, float(signed_distance(mesh, np.vstack(points), device).max()))
+    return max(0.0, float(signed_distance(mesh, np.vstack(points), device, winding=True).max()))

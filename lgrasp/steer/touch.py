@@ -93,8 +93,9 @@ def describe_touching(
 
 
 def moved_rows(told: Mapping[str, Any]) -> dict[str, Any]:
-    """``steered`` of a config for rows whose hand and object have moved since: they are above the plane still."""
-    kept = {name: told[name] for name in ("above",) if name in told}
+    """``steered`` of a config for rows whose hand and object have moved since: they are above the plane still, and
+    from as many poses."""
+    kept = {name: told[name] for name in ("above", "pose_count") if name in told}
     return {"steered": kept} if kept else {}
 
 

@@ -321,3 +321,14 @@ def test_reader_has_the_steps(path):
         np.testing.assert_array_equal(reader.column("sequence/q", 2, 5), steps.q[2:5])
         assert reader.columns["sequence/free_joints"] == ((12, 3, 6), np.dtype(bool))
         assert reader.space_names == tuple(f"finger {s}" for s in range(4))
+
+
+def test_a_split_by_pose_keeps_chains_together(tmp_path, make_sequence):
+    """The pose of a chain is that of its first object, and no parent is left behind."""
+    for shard in range(4):
+        made = make_sequence(COUNTS, shard_index=shard)
+        write_shard(tmp_path / f"{shard}.h5", made)
+    parts = GraspDataset(tmp_path).split(by="pose", shares=(0.5, 0.5))
+    seen = [np.stack([row["object_pose"][0] for row in part]) for part in parts]
+    assert all(len(poses) for poses in seen)
+    assert not {pose.tobytes() for pose in seen[0]} & {pose.tobytes() for pose in seen[1]}

@@ -136,6 +136,19 @@ def test_rows_that_stay_are_as_they_were(source, done):
         np.testing.assert_array_equal(kept, values[~replaced], err_msg=name)
 
 
+def test_rows_that_stay_are_measured_by_the_bounds_asked(source, refine, tmp_path):
+    """Joints that are controlled ten times as stiffly squeeze with targets that are a tenth as far ahead."""
+    done = refine(source, tmp_path, settings=("bounds.squeeze_stiffness=50",))
+    before, after, replaced = both(source, done)
+    assert 0 < replaced.sum() < len(after)
+    np.testing.assert_array_equal(after.q[~replaced], before.q[~replaced])
+    np.testing.assert_array_equal(after.object_pose[~replaced], before.object_pose[~replaced])
+    ahead = [np.abs(rows.q_squeeze - rows.q)[~replaced].max(1) for rows in (before, after)]
+    assert np.median(ahead[1] / ahead[0]) == pytest.approx(0.1, rel=0.2)
+    assert (after.metrics["stable_squeeze"] > before.metrics["stable_squeeze"])[~replaced].mean() > 0.8
+    assert validate_shard(done) == []
+
+
 def test_every_row_passes_the_judge(source, done):
     """Rows that were valid, and most of those that were spoilt; ``valid`` says of each what the judge finds."""
     _, after, replaced = both(source, done)

@@ -1,5 +1,7 @@
 """What the refiner promises: true gradients, samples by themselves, hands that leave the object and fit it."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch
@@ -123,6 +125,15 @@ def test_hands_that_are_none(make, valid):
                 ConfigError, match=r"^[Rtq] is .*; of \d hands a tensor \(\d.* of torch.float32 is accepted"
             ):
                 f(*wrong)
+
+
+def test_copies_and_a_module_that_is_moved(make, valid):
+    """A refiner stays of its type, and a copy of one that was used does the same."""
+    refiner, pose = make(matching_rounds=2), some(valid, slice(2))
+    found = refiner(*pose)
+    copy = deepcopy(torch.nn.ModuleList([refiner]).double())[0]
+    torch.testing.assert_close(copy(*pose).pose.t, found.pose.t)
+    torch.testing.assert_close(refiner.energy(*pose).total, copy.energy(*pose).total)
 
 
 def test_joints_stay_in_their_limits(make, valid):

@@ -85,9 +85,15 @@ class Distribution:
         return self.quantity.top * self.quantity.factor * np.linspace(0, 1, _HISTOGRAM_CELLS + 1) ** 4
 
     def quantile(self, share: float) -> float:
-        """Value below which a share of the rows lies, in the shown unit; there are rows."""
-        ends = np.concatenate([[0], np.cumsum(self.counts)])
-        return float(np.clip(np.interp(share * self.rows, ends, self.edges()), self.least, self.most))
+        """Value below which a share of the rows lies, in the shown unit; there are rows. Those of a cell are spread
+        evenly in it; between two rows it is interpolated, as of numpy.quantile."""
+        place = share * (self.rows - 1)
+        ranks = np.array([np.floor(place), np.ceil(place)])
+        ends, edges = np.cumsum(self.counts), self.edges()
+        cell = np.searchsorted(ends, ranks, side="right")
+        within = (ranks + 0.5 - (ends - self.counts)[cell]) / self.counts[cell]
+        low, high = np.clip(edges[cell] + within * (edges[cell + 1] - edges[cell]), self.least, self.most)
+        return float(low + (place - ranks[0]) * (high - low))
 
     def bars(self) -> tuple[np.ndarray, np.ndarray]:
         """Edges [41] and counts [40] of even bins that show nearly all values above 0, and the bound."""

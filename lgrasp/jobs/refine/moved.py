@@ -72,7 +72,7 @@ def move_rows(
         planes: those that the object rests on, (T, 5), where rows are of objects on a table: they must stay above it.
         keep_invalid: those rows are kept too, refined, with their own metrics, ``valid`` 0 and ``failed_bound``.
         stored: contacts of the rows are known, and rows that are not replaced stay as they are.
-        measured: metrics of the rows are of these bounds.
+        measured: the rows, their control poses and metrics, are of these bounds.
         progress: called with rows done.
     """
     refiner = Refiner(hand.model, obj, params, device=hand.device)
@@ -89,7 +89,7 @@ def move_rows(
     was, known, taken, good, failed = (np.concatenate([p.marks[k] for p in parts]) for k in range(5))
     terms = {f"energy_{name}": values for name, values in zip(Energies._fields, last_energy, strict=True)}
     valid = was | good
-    extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": taken}
+    extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": taken & _moved(rows, table, hand, obj)}
     extra |= {"failed_bound": np.where(valid, 0, failed)} if keep_invalid else {}
     extra = {name: np.asarray(values, np.float32) for name, values in extra.items()}
     made = grasp_rows(press(table), hand.model.tree, obj.center, extra=extra)
@@ -168,6 +168,13 @@ def _rounded(bounds: GraspBounds) -> GraspBounds:
     )
 
 
+def _moved(rows: GraspRows, table: GraspTable, hand: HandArrays, obj: ObjectModel) -> np.ndarray:
+    """Which hands (N,) are elsewhere in a table than in the rows that it was made of."""
+    pose, q = _hands(rows, slice(None), hand, obj)
+    far = np.maximum(np.abs(table.q - q).max(1), np.abs(table.pose - pose).max(1))
+    return ~(far <= _POSE_ROUNDING)
+
+
 def _ways(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Columns of rows on a table; hands without a way, which are invalid, keep the one that they had."""
     return {name: np.where(np.isnan(values), old[name], values).astype(old[name].dtype) for name, values in new.items()}
@@ -189,18 +196,21 @@ def _hands(rows: GraspRows, part: slice, hand: HandArrays, obj: ObjectModel) -> 
 
 
 def _kept(old: GraspRows, new: GraspRows, take: np.ndarray, measured: bool) -> GraspRows:
-    """``new`` with the stored rows of ``old`` but those to ``take``, with their metrics if ``measured``.
+    """``new`` with the stored rows of ``old`` but those to ``take``; of rows that are not ``measured`` by the same
+    bounds, postures and poses alone.
 
     Verdicts of a simulator are dropped: they are of the old rows.
     """
     changes, width = {}, max(np.shape(rows.contact_links)[2] for rows in (old, new))
-    for name in (*POSTURES, "object_pose", *CONTACTS):
+    for name in (*POSTURES, "object_pose", *CONTACTS) if measured else ("q", "object_pose"):
         x, y = (np.asarray(getattr(rows, name)) for rows in (old, new))
         if name in CONTACTS:
             x, y = (padded(v, (v.shape[1], width, *v.shape[3:])) for v in (x, y))
         changes[name] = _chosen(take, y, x)
+    if not measured:
+        return replace(new, **changes)
     metrics = {
-        name: np.where(take, values, old.metrics[name]) if measured and name in {*old.metrics} - _TOLD else values
+        name: np.where(take, values, old.metrics[name]) if name in {*old.metrics} - _TOLD else values
         for name, values in new.metrics.items()
     }
     table = {name: _chosen(take, values, np.asarray(old.table[name])) for name, values in new.table.items()}

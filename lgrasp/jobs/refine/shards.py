@@ -102,6 +102,11 @@ class RefineJob(RefineRequest, ShardJob):
         _check_rows(part.source, shard)
         hand = self._hand(part.source, shard)
         model = object_of_shard(self.cache, shard.objects[0], self.device_used)
+        if "network" in shard.header.config and not len(shard.objects[0].faces):
+            self.cache.warn(
+                f"{part.source}: a network planned these rows on surfaces that it guessed; here only the points of the "
+                "cloud are known, and rows that do not fit them are left out"
+            )
         told = stored_bounds(shard.header.config, part.source)
         bounds, params = self.numbers(told)
         begin = time.perf_counter()
@@ -114,7 +119,7 @@ class RefineJob(RefineRequest, ShardJob):
             planes=shard.objects[0].tables if shard.grasps.table else None,
             keep_invalid=self.keep_invalid,
             stored=self.form is None,
-            measured=(told.friction, told.torque_scale) == (bounds.friction, bounds.torque_scale),
+            measured=told.describe()["numbers"] == bounds.describe()["numbers"],
             progress=progress,
         )
         if moved.clamped:

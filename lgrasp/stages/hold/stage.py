@@ -10,7 +10,7 @@ from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 from lgrasp.stages.hold.params import HoldParams
 
-VERSION = 7
+VERSION = 8
 
 
 def run(inputs: GraspTable, params: HoldParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
