@@ -31,9 +31,10 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_ITERATIONS = wp.constant(12)
+_ITERATIONS = wp.constant(20)
 _STOP = wp.constant(1.0e-8)  # [J]
 _FORCE_STOP = wp.constant(0.02)  # [N]
+_NEAR = wp.constant(3.0e-5)  # [m] over which all normal forces do as much work as a step has to gain yet
 _SEARCH = wp.constant(10)  # points tried along a step
 
 
@@ -181,15 +182,19 @@ def _share_of_step(
 
 
 @wp.func
-def _press(m: Material, count: wp.int32, w: Scratch):
+def _press(m: Material, count: wp.int32, left: wp.float32, w: Scratch):
     """Set the normal forces, by which friction is bounded, to those at motions ``Y``; returns the largest change [N].
 
-    The points of a patch share its force evenly.
+    The points of a patch share its force evenly. While there is much energy ``left`` [J] to gain, forces may be beyond
+    what the drives press with: they only fall.
     """
+    pressing = float(0.0)
     for c in range(w.lane, count, w.lanes):
         y = w.Y[c]
         yn = wp.dot(w.contacts[c].normal, wp.vec3(y[0], y[1], y[2]))
         w.press[c] = m.contact * wp.max(-(w.contacts[c].gap + yn), 0.0)
+        pressing += w.press[c]
+    near = left < _NEAR * lanes_sum(pressing)
     meet()
     change = float(0.0)
     for c in range(w.lane, count, w.lanes):
@@ -203,6 +208,8 @@ def _press(m: Material, count: wp.int32, w: Scratch):
             total += w.press[end]
             end += 1
         force = total / float(end - first)
+        if not near:
+            force = wp.min(force, w.contacts[c].force)
         change = wp.max(change, wp.abs(force - w.contacts[c].force))
         w.contacts[c].force = force
     meet()
@@ -246,7 +253,7 @@ def solve_step(hand: Hand, m: Material, body: Body, count: wp.int32, w: Scratch)
         dx = dx + move * share
         for c in range(w.lane, count, w.lanes):
             w.Y[c] = w.Y[c] + w.Z[c] * share
-        change = _press(m, count, w)
+        change = _press(m, count, -slope, w)
         if -slope < _STOP and change < _FORCE_STOP:
             break
     _stretch(m, count, w)

@@ -2,7 +2,7 @@
 
 import pytest
 import trimesh
-from support.holding import HALF, RADIUS, pointed_hand, sliding, solid, turning
+from support.holding import HALF, RADIUS, flat, pointed_hand, sliding, solid, turning
 
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.object.arrays import ObjectArrays
@@ -12,6 +12,12 @@ from lgrasp.object.arrays import ObjectArrays
 def two_fingers(tmp_path_factory) -> HandArrays:
     """They slide along x."""
     return pointed_hand(tmp_path_factory.mktemp("two"), sliding(2))
+
+
+@pytest.fixture(scope="session")
+def two_plates(tmp_path_factory) -> HandArrays:
+    """The same with plates for tips, which touch at four points each."""
+    return pointed_hand(tmp_path_factory.mktemp("plates"), flat(sliding(2)))
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,13 @@ def test_a_block_between_two_fingers_slips_at_mu_n(two_fingers, box):
     assert np.isinf(found["hold_drift"]).tolist() == [True, True, False, False]
 
 
+def test_a_block_between_two_plates_slips_at_mu_n(two_plates, box):
+    """Whatever less they press with: what a moving object presses on for a moment lets friction hold no more."""
+    less, more = np.arange(0.5, 0.98, 0.02), np.arange(1.03, 1.3, 0.03)
+    found = HoldTester(two_plates, box, HoldTest(draws=0)).run(press(np.concatenate([less, more]) / (2 * 0.6)), 0)
+    assert found["hold_success"].tolist() == [0] * len(less) + [1] * len(more)
+
+
 @pytest.mark.parametrize("force", [1.0, 5.0])
 def test_a_block_slips_at_mu_n_for_any_friction(two_fingers, box, force):
     held = [

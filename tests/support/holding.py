@@ -30,8 +30,8 @@ FAR = """
 <joint name="far" type="prismatic"><parent link="base"/><child link="pad"/><origin xyz="0 0 -0.6"/><axis xyz="0 0 1"/>
   <limit lower="-0.01" upper="0.01"/></joint>"""
 FINGER = """
-<link name="tip{i}"><collision><origin xyz="{tip}" rpy="0.78539816 0.95531662 {yaw}"/>
-  <geometry><box size="{edge} {edge} {edge}"/></geometry></collision></link>
+<link name="tip{i}"><collision><origin xyz="{tip}" rpy="{rpy}"/>
+  <geometry><box size="{size}"/></geometry></collision></link>
 <joint name="j{i}" type="{kind}"><parent link="base"/><child link="tip{i}"/><origin xyz="{at}" rpy="0 0 {turn}"/>
   <axis xyz="{axis}"/><limit lower="-0.5" upper="0.5"/></joint>"""
 
@@ -43,14 +43,24 @@ def pointed_hand(folder: Path, fingers: Sequence[dict], links: Sequence[str] = (
         links: that hand.yaml names, of which distances are known; default: the pad alone.
     """
     path = folder / "hand.urdf"
-    body = "".join(FINGER.format(i=i, edge=TIP, **finger) for i, finger in enumerate(fingers))
+    body = "".join(FINGER.format(i=i, **finger) for i, finger in enumerate(fingers))
     path.write_text(f'<robot name="hand">{FAR}{body}</robot>')
     return upload_hand(build_hand(path, minimal_spec("hand", list(links))), "cpu")
 
 
+def corner(yaw: float) -> dict:
+    """The shape of a tip that touches with a corner."""
+    return {"rpy": f"0.78539816 0.95531662 {yaw}", "size": f"{TIP} {TIP} {TIP}"}
+
+
+def flat(fingers: Sequence[dict]) -> list[dict]:
+    """Sliding fingers whose tips are plates."""
+    return [finger | {"tip": "-0.005 0 0", "rpy": "0 0 0", "size": "0.01 0.02 0.03"} for finger in fingers]
+
+
 def sliding(count: int) -> list[dict]:
     angles = [2 * np.pi * i / count for i in range(count)]
-    same = {"kind": "prismatic", "axis": "1 0 0", "tip": f"{-CORNER} 0 0", "yaw": 0}
+    same = {"kind": "prismatic", "axis": "1 0 0", "tip": f"{-CORNER} 0 0"} | corner(0)
     return [same | {"at": f"{-AXIS * np.cos(a)} {-AXIS * np.sin(a)} 0", "turn": a} for a in angles]
 
 
@@ -58,7 +68,8 @@ def turning() -> list[dict]:
     """Their tips are on the box at joint position 0."""
     return [
         {"kind": "revolute", "axis": f"0 {-s} 0", "at": f"{s * HALF} 0 {-ARM}", "turn": 0}
-        | {"tip": f"{s * CORNER} 0 {ARM}", "yaw": np.pi * (s > 0)}
+        | {"tip": f"{s * CORNER} 0 {ARM}"}
+        | corner(np.pi * (s > 0))
         for s in (-1, 1)
     ]
 
