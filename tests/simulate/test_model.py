@@ -125,6 +125,15 @@ def test_a_dent_stays_open(tmp_path):
     assert hull.volume == cut.volume == pytest.approx(prism(YOU, 0.02).volume, rel=1e-5)
 
 
+def test_pieces_of_bodies_that_overlap_stay_in_them():
+    """What is inside one body is inside, however far from the other's surface."""
+    bars = [trimesh.creation.box(sides) for sides in ((0.12, 0.03, 0.03), (0.03, 0.12, 0.04))]
+    record = mesh_record("cross", trimesh.util.concatenate(bars))
+    found = object_of_record(record, lambda *_, **__: [bar.vertices for bar in bars])
+    assert found.excess < 1e-6
+    assert found.volume == pytest.approx(trimesh.boolean.union(bars).volume, rel=1e-5)
+
+
 def test_pieces_follow_the_mesh_with_few_corners():
     """A smooth ball is a piece of some hundred corners within a fifth of a millimetre, and weighs as the mesh."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.03)

@@ -323,6 +323,11 @@ def test_quantiles():
         distribution.add(part)
     for share in (0.05, 0.5, 0.95):
         assert distribution.quantile(share) == pytest.approx(1e3 * np.quantile(values, share), rel=0.02)
+    for few in ([0.02e-3, 0.1e-3], 95 * [0.01e-3] + 5 * [0.3e-3]):
+        of_few = Distribution(QUANTITIES[0])
+        of_few.add(np.array(few))
+        for share in (0.5, 0.95):
+            assert of_few.quantile(share) == pytest.approx(1e3 * np.quantile(few, share), rel=0.05)
     edges, counts = distribution.bars()
     np.testing.assert_allclose(counts.sum(), 5000)
     shown = np.histogram(1e3 * values, edges)[0]
