@@ -191,8 +191,9 @@ def _pose_numbers(reader: ShardReader, seed: int) -> np.ndarray:
     candidate = reader.column("candidate")
     if "sequence/parent" in reader.columns:  # the pose of a chain is that of its first object
         root, parent = np.arange(len(candidate)), reader.column("sequence/parent")
-        while len(later := np.flatnonzero(parent[root] >= 0)):
-            root[later] = parent[root[later]]
+        for _ in range(reader.column("object_index", 0, 0).shape[1]):
+            before = parent[root]
+            root = np.where((before >= 0) & (before < len(root)), before, root)
         candidate = candidate[root]
     return mixed(objects[_first(reader)] + mixed(pose_numbers(candidate, reader.header.config)))
 

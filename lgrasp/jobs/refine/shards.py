@@ -119,7 +119,7 @@ class RefineJob(RefineRequest, ShardJob):
             planes=shard.objects[0].tables if shard.grasps.table else None,
             keep_invalid=self.keep_invalid,
             stored=self.form is None,
-            measured=told.describe()["numbers"] == bounds.describe()["numbers"],
+            measured=told.model_copy(update={"min_hold_probability": 0.0, "profile": bounds.profile}) == bounds,
             progress=progress,
         )
         if moved.clamped:
