@@ -224,7 +224,8 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
     friction = MU
     if isinstance(told, dict) and isinstance(told.get("bounds"), dict):
         claims["profile"] = str(told["bounds"].get("profile"))
-        given = told["bounds"].get("friction")
+        numbers = told["bounds"].get("numbers")
+        given = numbers.get("friction") if isinstance(numbers, dict) else None
         friction = given if isinstance(given, float) and 0.0 < given <= 10.0 else MU
     return JudgedShard(
         path=path,

@@ -19,13 +19,14 @@ from scipy.spatial.transform import Rotation
 from support.jawshard import CUBE, JAW, PLATE, URDF, row, write_shard
 from typer.testing import CliRunner
 
+from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.judge.checks import CHECKS
 from lgrasp.judge.collision import JudgedHand, JudgedObject, PlacedSolids, object_in_object
 from lgrasp.judge.duplicates import distinct_poses, near_duplicates
 from lgrasp.judge.hand import origin
 from lgrasp.judge.meshes import MeshDistance
 from lgrasp.judge.run import judge
-from lgrasp.judge.shard import _resolver
+from lgrasp.judge.shard import _resolver, read_shard
 from lgrasp.judge.solids import SAMPLES, BoxSolid, CylinderSolid, MeshSolid, SphereSolid, on_links
 from lgrasp.judge.wrench import cone_forces, ferrari_canny, wrench_residual
 from lgrasp_cli.main import app
@@ -70,6 +71,15 @@ def test_valid_row_passes_with_exact_numbers(tmp_path: Path) -> None:
     assert deviations["gap [mm]"] == pytest.approx(0.5, abs=1e-3)
     assert deviations["normal_error [deg]"] == pytest.approx(np.degrees(0.1), abs=1e-3)
     assert len(deviations) == 6  # gswo twice; what merely has such a word in its name is another number
+
+
+@pytest.mark.parametrize(("told", "friction"), [(0.4, 0.4), ("0.4", 0.5), (-1.0, 0.5), (None, 0.5)])
+def test_epsilon_is_compared_at_the_friction_of_the_shard(tmp_path: Path, told: Any, friction: float) -> None:
+    path = write_shard(tmp_path / "s.h5", [row()])
+    with h5py.File(path, "r+") as f:
+        bounds = GraspBounds().describe()
+        f.attrs["config"] = json.dumps({"bounds": bounds | {"numbers": bounds["numbers"] | {"friction": told}}})
+    assert read_shard(path).friction == friction
 
 
 def _tilted() -> dict[str, Any]:
