@@ -99,7 +99,7 @@ class Manifest(_Listed):
         """What is known of files that may be a run's, by name."""
         return {s.file: s for r in self.runs if r.run_key in (run.run_key, "") for s in r.shards}
 
-    def ask(self, run: ListedRun, making: Collection[str], busy: Mapping[str, str] | None = None) -> None:
+    def ask(self, run: ListedRun, making: Collection[str], busy: Mapping[str, str]) -> None:
         """Take up what a run is asked for now: what was made stays so unless more rows are asked.
 
         Files of other runs are this run's from now on; those of this run that are not asked any more stay while they
@@ -112,7 +112,6 @@ class Manifest(_Listed):
         Raises:
             OutputError: A file is one of those.
         """
-        busy = busy or {}
         theirs = {s.file: busy[r.run_key] for r in self.runs if r.run_key in busy for s in r.shards}
         if taken := sorted(theirs.keys() & {shard.file for shard in run.shards}):
             host = theirs[taken[0]]

@@ -278,8 +278,10 @@ def _check_fixed(urdf: Urdf, spec: HandSpec, fixed: dict[str, float]) -> None:
     """Locked joints, and those that follow them, may be where they are held."""
     for joint in urdf.joints:
         value = fixed.get(joint.name, joint.lower)
-        if not joint.lower - LIMIT_EXCESS <= value <= joint.upper + LIMIT_EXCESS:
-            which = "locked joint" if joint.name in spec.locked else "joint that follows a locked one,"
+        which, excess = "joint that follows a locked one,", LIMIT_EXCESS
+        if joint.name in spec.locked:
+            which, excess = "locked joint", 1e-6
+        if not joint.lower - excess <= value <= joint.upper + excess:
             raise HandError(
                 f"hand '{spec.name}': {which} '{joint.name}' = {value:g} is outside its limits "
                 f"[{joint.lower:g}, {joint.upper:g}]"

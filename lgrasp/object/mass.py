@@ -58,8 +58,7 @@ def _solid_mesh(points: np.ndarray, faces: np.ndarray) -> tuple[float, np.ndarra
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
     if not len(joined) or len(open_edges(joined)):
         return None
-    found = _solid(points, faces)
-    union = _union(places, joined)
+    found, union = _solid(points, faces), _union(places, joined)
     if found is None or union is None or union.volume > (1.0 - _OVERLAP) * found[0]:
         return found
     return _solid(np.asarray(union.vertices), np.asarray(union.faces))
@@ -68,6 +67,8 @@ def _solid_mesh(points: np.ndarray, faces: np.ndarray) -> tuple[float, np.ndarra
 def _union(points: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh | None:
     """All bodies of a closed mesh as one; None if their boxes are apart, or they have no union."""
     body = bodies(faces)
+    if not body.any():  # one
+        return None
     shells = [trimesh.Trimesh(points, faces[body == k], process=False) for k in range(int(body.max()) + 1)]
     low, high = (np.array([shell.bounds[end] for shell in shells]) for end in (0, 1))
     volume = np.array([shell.volume for shell in shells])

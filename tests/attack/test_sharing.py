@@ -101,7 +101,7 @@ def test_two_users_share_a_manifest(common):
 
     def listing(name: str) -> bool:
         run = ListedRun(run_key=name, shards=[ListedShard(file=f"{name}.h5", shard_index=0, rows=0)])
-        update_manifest(common, lambda manifest: manifest.ask(run, ()))
+        update_manifest(common, lambda manifest: manifest.ask(run, (), {}))
         os.chmod(common / "manifest.json", 0o644)
         return True
 
