@@ -13,11 +13,9 @@ from lgrasp.runtime.turn import Turn, others_turn
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 
-_LAUNCHED_FIRST = 3
-"""Batches of one size that are launched step by step; capturing a graph takes as long as several of them."""
 _MOST_GRAPHS = 2
 """Graphs kept at a time: each holds the tables of a batch, and one is replayed while those of another are read."""
-_SAME_SIZE = (0.99, 1.03)
+_SAME_SIZE = (0.98, 1.05)
 """Share of the candidates wanted that a size may be and serve as well."""
 
 
@@ -34,7 +32,7 @@ class _CapturedGraph:
 class GraphCache:
     """Place through search of one pipeline, hand and object.
 
-    A size that comes again and again is captured; from then on it is replayed, with the seeds of the shard and the
+    A size that comes again is captured; from then on it is replayed, with the seeds of the shard and the
     first candidate of the batch put where the graph reads them. The tables of a replay are those of the thread that
     asked, until it asks again or calls :meth:`done`.
     """
@@ -43,7 +41,7 @@ class GraphCache:
         self._pipeline = pipeline
         self.turn = Turn()
         """Held by the thread that runs a batch; whoever else uses the device must hold it too."""
-        self._times: dict[int, int] = {}  # by size, the latest last
+        self._sizes: list[int] = []  # that there were, the latest last
         self._graphs: list[_CapturedGraph] = []
         self._held: dict[int, _CapturedGraph] = {}  # by thread
         self._free = threading.Semaphore(_MOST_GRAPHS)
@@ -51,13 +49,14 @@ class GraphCache:
     def size(self, wanted: int) -> int:
         """Candidates for a batch that should have about ``wanted``: a size that was there before, if one is close."""
         low, high = (wanted * share for share in _SAME_SIZE)
-        return next((n for n in reversed(tuple(self._times)) if low <= n <= high), wanted)
+        return next((n for n in reversed(self._sizes) if low <= n <= high), wanted)
 
     def run(self, context: Context, first: int, count: int) -> tuple[ContactSets, Meter]:
         """The sets of candidates ``first .. first + count - 1``, and their counts and seconds."""
         self.done()
-        self._times[count] = self._times.pop(count, 0) + 1
-        if self._times[count] <= _LAUNCHED_FIRST:
+        new = count not in self._sizes
+        self._sizes = [*(n for n in self._sizes if n != count), count]
+        if new:
             meter = Meter(context.device)
             return run_stages(self._pipeline, context, first, count, "search", meter), meter
         captured = self._take(context, count)
@@ -92,7 +91,7 @@ class GraphCache:
         found = next((graph for graph in idle if graph.count == count), None)
         if found is None:
             if len(self._graphs) == _MOST_GRAPHS:
-                self._graphs.remove(min(idle, key=lambda graph: list(self._times).index(graph.count)))
+                self._graphs.remove(min(idle, key=lambda graph: self._sizes.index(graph.count)))
             found = self._capture(context, count)
             self._graphs.append(found)
         return found

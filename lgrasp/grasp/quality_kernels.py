@@ -98,9 +98,8 @@ def resist_loads(obj: Object, limits: Limits, places: Places, at: CheckedPosture
     for c in range(k):
         points[c] = points[c] - obj.com
     turn = wp.quat_inverse(wp.transform_get_rotation(at.pose[at.of[i]]))
-    if limits.whole == 1:
-        worst = 0.0  # the answer does not depend on which direction came first
-    load = unresisted(points, normals, k, limits.friction, turn, direction, worst, most)
+    # not until it is below the worst so far: the answer would depend on which direction came first
+    load = unresisted(points, normals, k, limits.friction, turn, direction, 0.0, most)
     wp.atomic_max(found_out.unresisted_load, i, load)
 
 

@@ -53,6 +53,7 @@ class GenerateJob(GenerateRequest, SearchJob):
 
     _graphs: GraphCache | None = PrivateAttr(None)
     _rate: float = PrivateAttr(1.0)
+    _tried: Counter[str] = PrivateAttr(default_factory=Counter)
     _writers: ProcessPool | None = PrivateAttr(None)
 
     @model_validator(mode="after")
@@ -82,7 +83,7 @@ class GenerateJob(GenerateRequest, SearchJob):
 
     @property
     def measured_rate(self) -> float:
-        """Rows per candidate of the last shard made; ``rate`` if none was."""
+        """Rows per candidate of the shards made; ``rate`` if none was."""
         return self._rate if self._inputs else self.rate
 
     def own_config(self) -> dict[str, Any]:
@@ -96,9 +97,15 @@ class GenerateJob(GenerateRequest, SearchJob):
     def gave_up(self, rows: int, found: Found) -> bool:
         return gave_up(self.pipeline, rows, found.rows, found.tried)
 
+    def load(self, events: Events, missing: bool) -> None:
+        if missing and self.writers() > 1:
+            self._writers = ProcessPool(self.writers())
+            self._writers.start(write_shard.__module__)
+        super().load(events, missing)
+
     def load_inputs(self, events: Events) -> Inputs:
         pipeline, device, self._rate = self.pipeline, self.device_used, self.rate
-        self._graphs = GraphCache(pipeline) if device.is_cuda and self.threads() == 1 else None
+        self._graphs = GraphCache(pipeline) if self.replays else None
         what = self.keys, self.scale, pipeline.object, pipeline.field, device, events.loading
         return load_inputs(self.cache, *what, table=pipeline.on_table, steer=pipeline.steer)
 
@@ -107,10 +114,15 @@ class GenerateJob(GenerateRequest, SearchJob):
             object_record(inputs.object.model, tables=inputs.object.planes, steered=inputs.object.steered)
         ]
 
+    @property
+    def replays(self) -> bool:
+        """Whether batches are replayed: by one worker on a GPU."""
+        return self.device_used.is_cuda and self.threads() == 1
+
     def at_once(self) -> int:
         # on the host a GPU's shard is finished while the next are searched
         alone = self.negatives or self.protocol or self.pipeline.params("search").passes > 1
-        return 1 if alone or not self._graphs else _SHARDS_ON_GPU
+        return 1 if alone or not self.replays else _SHARDS_ON_GPU
 
     def writers(self) -> int:
         # one thread writes a tenth of what a GPU finds
@@ -140,9 +152,8 @@ class GenerateJob(GenerateRequest, SearchJob):
             resume=part.number in self._growing,
             progress=lambda rows, result: progress(rows, kept=result.resumed),
         )
-        if self._writers is None and self.writers() > 1:  # the first part is made alone
-            self._writers = ProcessPool(self.writers())
-        self._rate = max(last_survivors(result.counts) / result.candidates, 1e-3)
+        self._tried.update(candidates=result.candidates, rows=last_survivors(result.counts))
+        self._rate = max(self._tried["rows"] / self._tried["candidates"], 1e-3)
         # poses and contacts go from the internal to the user's frame of the object
         tree, center = self.inputs.hand.model.tree, self.inputs.object.model.center
         grasps, told = result.grasps, {"candidates": result.candidates}

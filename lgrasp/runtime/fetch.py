@@ -4,6 +4,7 @@ The only way there: Warp's own ``array.numpy()`` puts another stream in the plac
 every thread, so that two at once may leave the device without its own.
 """
 
+import time
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 
@@ -14,6 +15,7 @@ from lgrasp.runtime.turn import others_turn
 
 _ALIGNMENT = 256  # bytes that places in the staging memory are rounded up to
 _LEAST_STAGING = 1 << 20  # bytes
+_CAPTURE_STEP = 0.0005  # [s]; a graph is captured in some 10 ms
 _staging: list[wp.array] = []  # what nobody uses just now
 
 
@@ -42,10 +44,22 @@ def fetch(arrays: Sequence[wp.array], *, others: bool = False) -> list[np.ndarra
         out.append(host)
     copied = device.stream.record_event(wp.Event(device))
     with waiting():
-        wp.synchronize_event(copied)
+        wait_for(copied)
         copies = [host.numpy().copy() for host in out]
     _staging.append(memory)
     return copies
+
+
+def wait_for(event: wp.Event) -> None:
+    """Until an event has come; Warp refuses to wait while another thread captures a graph."""
+    while True:
+        try:
+            wp.synchronize_event(event)
+            return
+        except RuntimeError as error:
+            if "graph capture" not in str(error):
+                raise
+        time.sleep(_CAPTURE_STEP)
 
 
 def _take_staging(size: int) -> wp.array:

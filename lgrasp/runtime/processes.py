@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import ModuleType, TracebackType
@@ -119,11 +120,17 @@ class ProcessPool(ProcessPoolExecutor):
 
     def __init__(self, workers: int) -> None:
         start_tracker()
+        self._workers = workers
         super().__init__(workers, multiprocessing.get_context("spawn"), follow_parent)
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         with spared(), _no_main():  # it starts processes
             return super().submit(fn, *args, **kwargs)
+
+    def start(self, module: str) -> None:
+        """Have every process start, and load what a module needs, before there is work."""
+        for _ in range(self._workers):
+            self.submit(import_module, module)
 
     def __exit__(
         self, exc_type: type[BaseException] | None, exc_val: BaseException | None, exc_tb: TracebackType | None

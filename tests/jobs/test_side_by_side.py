@@ -8,7 +8,6 @@ from support.jobs import StopAfter
 from support.workers import lost
 
 from lgrasp.dataset.validate import validate_shard
-from lgrasp.engine.graphs import GraphCache
 from lgrasp.engine.report import job_report
 from lgrasp.engine.run import run as generate
 from lgrasp.engine.run import run as run_job
@@ -21,14 +20,7 @@ _COUNTED = ("grasps", "strict", "distinct_poses", "published_count", "force_clos
 
 @pytest.fixture
 def side_by_side(monkeypatch):
-    load = GenerateJob.load_inputs
-
-    def replaying(self, events):
-        inputs = load(self, events)
-        self._graphs = GraphCache(self.pipeline)
-        return inputs
-
-    monkeypatch.setattr(GenerateJob, "load_inputs", replaying)
+    monkeypatch.setattr(GenerateJob, "replays", True)
     monkeypatch.setattr("lgrasp.jobs.generate.cores", lambda: 2)
 
 

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from support.sources import modules_with, parse
 
-from lgrasp.runtime.fetch import fetch
+from lgrasp.runtime.fetch import fetch, wait_for
 
 
 @pytest.mark.parametrize("n", [0, 1, 1000])
@@ -42,3 +42,21 @@ def test_device_arrays_come_to_the_host_in_one_place():
                 if not (isinstance(x, ast.Call) and isinstance(x.func, ast.Attribute) and x.func.attr == "cpu")
             ]
     assert not found
+
+
+def test_waits_while_another_thread_captures_a_graph(monkeypatch):
+    """Warp refuses to wait then; every other error is passed on."""
+    answers = [RuntimeError("Cannot synchronize event while graph capture is active"), None]
+    asked = []
+
+    def synchronize(event):
+        asked.append(event)
+        if answer := answers.pop(0):
+            raise answer
+
+    monkeypatch.setattr("lgrasp.runtime.fetch.wp.synchronize_event", synchronize)
+    wait_for("event")
+    assert asked == ["event"] * 2
+    answers.append(RuntimeError("an illegal memory access was encountered"))
+    with pytest.raises(RuntimeError, match="illegal"):
+        wait_for("event")
