@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -247,21 +247,20 @@ def run(
     array, device, every, parts, present = todo = look(job, array=array, resume=resume)
     absent = [part for part in parts if not os.path.lexists(part.file)]
     job.clean(parts)
-    outcome = JobOutcome(job, device, parts, present, seconds={"kernels": prepare(job, todo)})
-    if resume and absent:  # another run may have made files in the meantime
-        job.present(absent)
-    events.started(parts, present)
-    begin = time.perf_counter()
-    try:
-        manifests = Renewing(parts)
-        if not job.in_place:
-            manifests = Listing(lambda: _described(job, array), job.folder, every, parts, asks=job.asks)
-        with manifests.kept(present) as job._manifests:
-            _make_parts(job, events, outcome, job._manifests, replaces=[] if resume else every)
-    except CancelledError:
-        outcome.cancelled = True
-    finally:
-        job.close()
+    with closing(job):
+        outcome = JobOutcome(job, device, parts, present, seconds={"kernels": prepare(job, todo)})
+        if resume and absent:  # another run may have made files in the meantime
+            job.present(absent)
+        events.started(parts, present)
+        begin = time.perf_counter()
+        try:
+            manifests = Renewing(parts)
+            if not job.in_place:
+                manifests = Listing(lambda: _described(job, array), job.folder, every, parts, asks=job.asks)
+            with manifests.kept(present) as job._manifests:
+                _make_parts(job, events, outcome, job._manifests, replaces=[] if resume else every)
+        except CancelledError:
+            outcome.cancelled = True
     outcome.seconds["parts"] = time.perf_counter() - begin
     outcome.seconds["total"] = time.perf_counter() - start
     return outcome
