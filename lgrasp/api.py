@@ -416,6 +416,6 @@ def _made(paths: Sequence[Path], asked: int = 0, nothing: str = "no grasp found"
     found = Grasps.of_shard(shard)
     if not len(found):
         raise StarvedError(nothing)
-    if len(found) < asked:
-        warnings.warn(f"{len(found):,} of {asked:,} grasps found", stacklevel=4)
+    if (passed := int(found.valid.sum())) < asked:
+        warnings.warn(f"{passed:,} of {asked:,} grasps found", stacklevel=4)
     return found

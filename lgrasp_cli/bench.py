@@ -211,7 +211,7 @@ def bench_sequence(
     drawn = object_sequences(pool, sets, seed)
     asked = [parse_model(SequenceRequest, how | {"objects": names}, "bench sequence") for names in drawn]
     if model is not None:
-        own = choose_pipeline("sample", seed).with_params("sequence", policy=policy, width=width)
+        own = choose_pipeline("sample", seed, settings=settings).with_params("sequence", policy=policy, width=width)
         how |= {"pipeline": own, "model": model}
         asked += [parse_model(SampleRequest, how | {"objects": names}, "bench sequence") for names in drawn]
     for request in asked:

@@ -100,11 +100,11 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
     named = len(objects) == 1 and (config or objects[0] in scene_configs())
     data: dict[str, Any] = read_scene_config(objects[0]) if named else {"objects": objects}
     data |= changes
-    scene = data.setdefault("scene", {})
-    if on_table is not None:
-        scene["objects"] = on_table
-    if views is not None:
-        scene.setdefault("camera", {})["views"] = views
+    if on_table is not None or views is not None:
+        scene = data["scene"] = data.get("scene") or {}
+        scene |= given(objects=on_table)
+        if views is not None:
+            scene["camera"] = (scene.get("camera") or {}) | {"views": views}
     return data
 
 

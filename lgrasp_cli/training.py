@@ -52,7 +52,7 @@ def normalisation(
     split_file: Annotated[
         Path | None, Option("--split", help="File written by dataset split; only rows of --part are measured.")
     ] = None,
-    part: Annotated[str, Option(help="Part of the split.")] = "train",
+    part: Annotated[str | None, Option(help="Part of the split; default: train.")] = None,
     negatives: Negatives = False,
 ) -> Answer:
     """Write mean and deviation of hand position, 6D rotation (in the object's frame) and joints over all rows.

@@ -41,7 +41,7 @@ class Normalisation(JsonFile):
 
     @classmethod
     def of(
-        cls, paths: Paths, *, split: Split | str | Path | None = None, part: str = "train", negatives: bool = False
+        cls, paths: Paths, *, split: Split | str | Path | None = None, part: str | None = None, negatives: bool = False
     ) -> Self:
         """Measure the rows of shards of one hand; arguments and errors as of :class:`GraspIterableDataset`."""
         data = GraspIterableDataset(

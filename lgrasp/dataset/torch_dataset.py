@@ -17,7 +17,7 @@ from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.merge import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.split import Split, draw_split, read_groups
-from lgrasp.errors import ShardError
+from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import CHUNK_ROWS, SEQUENCE_FIELDS
 
@@ -44,17 +44,24 @@ class TorchRows:
         negatives: Rows with metric ``valid`` 0 too, which fail a bound; :attr:`failed_bounds` names it by the code in
             column ``metrics/failed_bound``.
         split: Only rows of a ``part`` of this split (of :meth:`GraspDataset.split`, or a file of ``lgrasp dataset
-            split``).
+            split``); of ``train`` if none is named.
 
     Raises:
         ShardError: A shard cannot be read, hands differ, or a shard lacks a column.
-        ConfigError: The split cannot be read, or has no such part.
+        ConfigError: The split cannot be read, or has no such part; a part without a split.
     """
 
     def __init__(
-        self, paths: Paths, columns: Sequence[str] | None, negatives: bool, split: Split | str | Path | None, part: str
+        self,
+        paths: Paths,
+        columns: Sequence[str] | None,
+        negatives: bool,
+        split: Split | str | Path | None,
+        part: str | None,
     ) -> None:
-        self._negatives, self._part = negatives, part
+        if part is not None and split is None:
+            raise ConfigError(f"part '{part}' is of no split: give split as well")
+        self._negatives, self._part = negatives, part or "train"
         self._split = split if split is None or isinstance(split, Split) else Split.read(split)
         found = [shard.value for shard in gather(paths, self._survey, invalid=negatives)]
         self._sources = [source for source in found if source.rows] if self._split else found
@@ -159,7 +166,7 @@ class GraspDataset(TorchRows, torch.utils.data.Dataset):
         cache_bytes: int = 1 << 29,
         negatives: bool = False,
         split: Split | str | Path | None = None,
-        part: str = "train",
+        part: str | None = None,
     ) -> None:
         super().__init__(paths, columns, negatives, split, part)
         self._cache_bytes = cache_bytes

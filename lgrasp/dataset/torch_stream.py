@@ -47,7 +47,7 @@ class GraspIterableDataset(TorchRows, torch.utils.data.IterableDataset):
         ranks: int | None = None,
         negatives: bool = False,
         split: Split | str | Path | None = None,
-        part: str = "train",
+        part: str | None = None,
     ) -> None:
         super().__init__(paths, columns, negatives, split, part)
         together = torch.distributed.is_available() and torch.distributed.is_initialized()

@@ -36,6 +36,8 @@ from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object, list_objects, mesh_files
 from lgrasp.steer.params import Steering
 
+_OF_SINGLE = ("batch", "negatives", "passes", "scale", "simulate", "table")  # keys for one object a grasp
+
 
 class JobConfig(Params):
     """Many hands and objects in one run: configs/NAME.yaml. Paths are relative to the current folder."""
@@ -78,8 +80,10 @@ class JobConfig(Params):
     def _has_objects(self) -> "JobConfig":
         if not self.objects and not self.object_dir and not self.sequences:
             raise ValueError("objects: name at least one")
-        if self.simulate and self.sequences:
-            raise ValueError("simulate: of sequences it is a key of 'sequences'")
+        for name in _OF_SINGLE if self.sequences else ():
+            if getattr(self, name) != type(self).model_fields[name].default:
+                told = "a key of 'sequences'" if name in SequenceSets.model_fields else "no key"
+                raise ValueError(f"{name}: of sequences it is {told}")
         return self
 
 

@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lgrasp.dataset.conditions import parse_condition
+from lgrasp.dataset.exports.folder import clear
 from lgrasp.dataset.exports.formats import FORMATS, export_shards
-from lgrasp.dataset.exports.selection import chosen_rows, number_columns
+from lgrasp.dataset.exports.selection import chosen_rows, number_columns, verdict_columns
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.reader import ShardReader
@@ -23,7 +24,6 @@ from lgrasp.errors import OutputError
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.schema import TABLE_FIELDS
 from lgrasp.jobs.requests.shards import ExportRequest
-from lgrasp.simulate.protocol import HOLDS
 
 _INDEX = "export.json"  # the last file of an export: one without it is not whole
 
@@ -37,17 +37,17 @@ class ExportJob(ExportRequest, Job):
 
     def key(self) -> str:
         where = [parse_condition(text) for text in self.where]
-        columns = {condition.column for condition in where} | {HOLDS, "metrics/valid", *TABLE_FIELDS}
+        columns = {condition.column for condition in where} | {*TABLE_FIELDS}
 
         def digest(reader: ShardReader) -> str:
             chosen_rows(reader, where, single=FORMATS[self.to].single)  # the files that the export leaves out
             numbers = number_columns(reader) if self.to == "webdataset" else ()
-            return rows_digest(reader, sorted(columns & reader.columns.keys() | {*numbers}))
+            return rows_digest(reader, sorted(columns & reader.columns.keys() | {*verdict_columns(reader), *numbers}))
 
         rows = [shard.value for shard in gather(self.shards, digest)]
         options = {"limit": self.limit, "where": list(self.where), "licence": self.licence}
         parts = Split.read(self.split).model_dump(mode="json") if self.split else None
-        return content_key("export", 3, to=self.to, rows=rows, split=parts, **options)
+        return content_key("export", 4, to=self.to, rows=rows, split=parts, **options)
 
     def parts(self) -> list[Part]:
         tell_differences(self.shards)
@@ -72,6 +72,7 @@ class ExportJob(ExportRequest, Job):
         def advance(done: int, total: int) -> None:
             replace(progress, part=replace(part, rows=total))(done)
 
+        clear(self.out)  # where it is to be replaced: it stays otherwise
         done = export_shards(self.shards, self.out, self.to, advance=advance, **how)
         return Made(done.rows, (), list(done.objects))
 

@@ -129,6 +129,9 @@ def test_split_errors(folder, tmp_path, make_shard):
     made = make_split(folder, by="object")
     with pytest.raises(ConfigError, match="no part 'dev'"):
         GraspDataset(folder, split=made, part="dev")
+    for kind in (GraspDataset, GraspIterableDataset, Normalisation.of):
+        with pytest.raises(ConfigError, match="part 'test' is of no split"):
+            kind(folder, part="test")
     write_shard(tmp_path / "new.h5", make_shard(3, seed=9))
     shard = read_shard(tmp_path / "new.h5")
     objects = [replace(o, sha256="e" * 64) for o in shard.objects]

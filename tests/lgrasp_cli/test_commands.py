@@ -205,7 +205,9 @@ def test_run_on_several_devices(cli, tmp_path, monkeypatch):
         ("objects: [tiny]\nobject_dir: nowhere", "nowhere"),
         ("objects: [tiny]\nheld_out: [tiny]", "held_out: none of the 1 objects is left"),
         ("objects: [tiny]\npipelines: [swift, ./swift.yaml]", "pipelines swift and ./swift.yaml have one name"),
-        ("objects: [tiny]\nsequences: {sets: 1}\nsimulate: fc", "simulate: of sequences"),
+        ("objects: [tiny]\nsequences: {sets: 1}\nsimulate: fc", "simulate: of sequences it is a key of 'sequences'"),
+        ("objects: [tiny]\nsequences: {sets: 1}\ntable: true", "table: of sequences it is no key"),
+        ("objects: [tiny]\nsequences: {sets: 1}\nscale: 0.001", "scale: of sequences it is a key of 'sequences'"),
         ("objects: [tiny]\ndevice: cpu,gpu", "key 'device' = 'cpu,gpu': device 'gpu' cannot be"),
     ],
 )

@@ -1,8 +1,6 @@
 """What makes an export a data set that can be published: a card, the runs that the rows are of, checksums."""
 
 import json
-import shlex
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +44,7 @@ Licence: {licence}. The hand in `hand/` and the meshes in `{meshes}/` keep the l
 {run_lines}
 
 The hand's SHA-256 is `{sha256}`. `{runs}` has all parameters of each run; the same hand, object, parameters
-and seed give the same grasps{command}.{conditions}
+and seed give the same grasps.{conditions}
 """
 
 _PARTS = """
@@ -125,16 +123,5 @@ def _card(out: Path, selection: Selection, licence: str, conditions: list[str], 
         ),
         sha256=selection.hand.sha256,
         runs=RUNS,
-        command=_command(runs),
         conditions=f" Rows were chosen by {' and '.join(conditions)}." if conditions else "",
     )
-
-
-def _command(runs: list[dict[str, Any]]) -> str:
-    """The command of the first run of a single object, as an example."""
-    for run in runs:
-        if len(run["objects"]) == 1:
-            options = {"--hand": run["hand"], "--object": run["objects"][0], "--pipeline": run["pipeline"]}
-            options["--seed"] = str(run["seed"])
-            return f", such as `lgrasp generate {shlex.join(chain(*options.items()))}`"
-    return ""

@@ -49,6 +49,31 @@ UNFINISHED = "unfinished.json"
 _FEW = 8  # names in the README
 
 
+def clear(out: Path) -> None:
+    """Remove the whole export that a folder holds, if it holds one.
+
+    Raises:
+        OutputError: It holds other files, too.
+    """
+    try:
+        listed_files = json.loads((out / INDEX).read_bytes())["files"]
+        known = {out / name for name in listed_files} | {out / INDEX}
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    there = _files(out)
+    if other := sorted(path.name for path in there if path not in known):
+        raise OutputError(f"{out} holds {other[0]}, which is not of the export; move it, or choose another --out")
+    for path in there:
+        path.unlink()
+    for folder in sorted((path for path in out.rglob("*") if path.is_dir()), reverse=True):
+        folder.rmdir()
+
+
+def _files(out: Path) -> list[Path]:
+    """All files of an export, with their folders."""
+    return [path for path in out.rglob("*") if path.is_file() or path.is_symlink()]
+
+
 def write_assets(out: Path, selection: Selection) -> None:
     """Write the hand (URDF and meshes) and the meshes of the objects, in metres, as OBJ.
 
@@ -106,7 +131,7 @@ def write_index(
     Raises:
         OutputError: The folder cannot be written.
     """
-    document = {
+    document: dict[str, Any] = {
         "format": INDEX_FORMAT,
         "format_version": "1.0",
         "layout": layout,
@@ -139,6 +164,7 @@ def write_index(
         },
     }
     remove_leftovers(out, "**/*.tmp")
+    document["files"] = sorted(path.relative_to(out).as_posix() for path in _files(out) if path.name != UNFINISHED)
     write_file(out / UNFINISHED, json.dumps(document, indent=2) + "\n")
     os.replace(out / UNFINISHED, out / INDEX)
 

@@ -18,10 +18,10 @@ from lgrasp.dataset.split import Split
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import CHUNK_ROWS
-from lgrasp.simulate.protocol import HOLDS
 from lgrasp.words import plural
 
 _NUMBER = re.compile("metrics/|physics/|candidate$")
+_VERDICT = re.compile("physics/.+_holds$|metrics/valid$")
 
 
 class ExportObject(NamedTuple):
@@ -159,7 +159,7 @@ class Selection:
             pose = np.take_along_axis(pose, present[..., None], 1)
             index = np.take_along_axis(index, present, 1)
         holds = np.ones(len(some))
-        for name in {HOLDS, "metrics/valid"} & reader.columns.keys():
+        for name in verdict_columns(reader):
             holds *= read(name) > 0
         q, before, squeeze = (read(name)[:, source.columns] for name in ("q", "q_pregrasp", "q_squeeze"))
         table = {}
@@ -271,6 +271,11 @@ def chosen_rows(
 def number_columns(reader: ShardReader) -> list[str]:
     """Columns that tell of a row in one number: metrics, verdicts, and ``candidate``."""
     return [name for name, (shape, _) in reader.columns.items() if len(shape) == 1 and _NUMBER.match(name)]
+
+
+def verdict_columns(reader: ShardReader) -> list[str]:
+    """Columns whose zeros tell that a row failed: in a simulator, by whatever protocol, or a bound."""
+    return [name for name in reader.columns if _VERDICT.match(name)]
 
 
 def _plane(source: _Source, item: int, plane: int) -> np.ndarray:

@@ -19,6 +19,7 @@ from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 _MAX_ROWS = 2_000_000  # rows held for comparison
 _BLOCK_ROWS = 16_384
 _SAMPLE_ROWS = 50_000
+_HASH_START, _HASH_PRIME = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
 
 
 class NearRows:
@@ -32,16 +33,21 @@ class NearRows:
     """
 
     def __init__(self, device: str | None) -> None:
-        self.compared = self.duplicates = self.poses = 0
+        self.compared = self.duplicates = 0
         self._device = device
         self._kept: KeptRows | None = None
-        self._last: np.ndarray | None = None
+        self._poses = DistinctRows()
+
+    @property
+    def poses(self) -> int:
+        """Poses so far, each counted once."""
+        return len(self._poses)
 
     def add(self, pose: np.ndarray, q: np.ndarray) -> None:
         """Compare further rows: object poses [n, o, 7], of the same objects in every row, and joints [n, K]."""
         if not len(pose):
             return
-        self._count_poses(np.ascontiguousarray(pose.reshape(len(pose), -1)))
+        self._poses.add(pose.reshape(len(pose), -1))
         if self._device is None:
             return
         if pose.shape[1] > 1:
@@ -67,12 +73,32 @@ class NearRows:
         self.compared += n
         self.duplicates += int(drop.sum())
 
-    def _count_poses(self, pose: np.ndarray) -> None:
-        """Rows of one object pose follow one another; a call may begin in the midst of them."""
-        self.poses += len(np.unique(pose, axis=0))
-        if self._last is not None and np.array_equal(self._last, pose[0]):
-            self.poses -= 1
-        self._last = pose[-1]
+
+class DistinctRows:
+    """How many different rows there are in a stream, by 64-bit hashes, of which each different one is held."""
+
+    def __init__(self) -> None:
+        self._known = np.zeros(0, np.uint64)
+        self._new: list[np.ndarray] = []
+
+    def add(self, rows: np.ndarray) -> None:
+        """Take further rows, [n, k] of one kind of number with 4 or 8 bytes."""
+        words = np.ascontiguousarray(rows).view(np.uint32).astype(np.uint64)
+        hashes = np.full(len(words), _HASH_START, np.uint64)
+        for column in words.T:
+            hashes = (hashes ^ column) * _HASH_PRIME
+            hashes ^= hashes >> np.uint64(32)
+        self._new.append(np.unique(hashes))
+        if sum(map(len, self._new)) > max(len(self._known), _BLOCK_ROWS):
+            self._merge()
+
+    def __len__(self) -> int:
+        self._merge()
+        return len(self._known)
+
+    def _merge(self) -> None:
+        if self._new:
+            self._known, self._new = np.unique(np.concatenate([self._known, *self._new])), []
 
 
 class EvenSample:

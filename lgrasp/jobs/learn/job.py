@@ -108,9 +108,13 @@ def energy_numbers(found: Measured) -> dict[str, Any]:
 
 
 def read_examples(
-    shards: Sequence[Path], name: str | None, params: LearnParams, cache: Cache, device: str
+    shards: Sequence[Path], name: str | None, params: LearnParams, cache: Cache, device: str, *, stream: int = 0
 ) -> tuple[HandModel, list[Examples], list[Examples]]:
-    """The hand; clouds to train on and others, with the grasps, object by object."""
+    """The hand; clouds to train on and others, with the grasps, object by object.
+
+    Args:
+        stream: of random numbers: clouds of another have nothing in common, whatever the seed.
+    """
     parts = read_parts(shards)
     found = resolve_device(device)
     hand, _ = load_hand(parts.values(), name, cache, found)
@@ -121,7 +125,7 @@ def read_examples(
             continue
         model = object_of_shard(cache, part.record, found)
         for which, (into, clouds) in enumerate(zip(sets, (params.clouds, params.held_out), strict=True)):
-            rng = np.random.default_rng([params.seed, number, which])
+            rng = np.random.default_rng([params.seed, number, 2 * stream + which])
             q = rows["q"][:, : hand.dofs]
             into.append(make_examples(hand, model, rows["T_hand_object"], q, params, rng, clouds, device))
     if not sets[0]:
@@ -147,7 +151,7 @@ def evaluate(
     alias = resolve_device(device).alias
     net, saved = load_predictor(path)
     params = LearnParams.model_validate(saved["params"]).model_copy(update={"clouds": clouds, "seed": seed})
-    hand, examples, _ = read_examples(shards, None, params.model_copy(update={"held_out": 1}), cache, alias)
+    hand, examples, _ = read_examples(shards, None, params.model_copy(update={"held_out": 1}), cache, alias, stream=1)
     check_network_hand(path, saved["hand"], saved["hand_sha256"], hand.name, hand.sha256, words=SHARDS)
     trainer, bounds = Trainer(hand, examples, params, device=alias), GraspBounds()
     trainer.net.load_state_dict(net.state_dict())

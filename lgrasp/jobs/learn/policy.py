@@ -111,7 +111,7 @@ class PolicyJob(PolicyRequest, FileJob):
                 progress((self.count + len(examples)) // 2, f"{gave:,} poses gave grasps")
         seconds = {"examples": time.perf_counter() - start}
         order = np.random.default_rng(p.seed).permutation(self.count)
-        held = max(1, round(p.held_out * self.count))
+        held = min(max(1, round(p.held_out * self.count)), self.count - 1)
         train, test = (join_examples([examples[k] for k in some]) for some in (order[held:], order[:held]))
         if train.contacts_yields.sum() < _LEAST:
             raise ConfigError(

@@ -18,6 +18,7 @@ from lgrasp.engine.folder import Found, shard_path
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.run import Job, run
 from lgrasp.errors import ConfigError, ShardError
+from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.generate import GenerateJob
@@ -153,7 +154,7 @@ def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Event
     found = read_parts(config.grasps or _generated(config, cache, events))
     there, wanted = {part.record.sha256: part.record.id for part in found.values()}, set()
     for name in config.objects if config.grasps else ():
-        wanted.add(source := hashlib.sha256(find_object(name).read_bytes()).hexdigest())
+        wanted.add(source := mesh_digest(mesh_bytes(find_object(name))))
         if source not in there:
             raise ConfigError(f"{config.grasps} has no grasps of object '{name}'; it has {', '.join(there.values())}")
     chosen = {key: part for key, part in found.items() if not wanted or part.record.sha256 in wanted}

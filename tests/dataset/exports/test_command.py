@@ -180,3 +180,19 @@ def test_what_is_left_out_is_told_once(cli, tmp_path, shards):
     assert "3 of 1 object" in out
     (line,) = set(err.splitlines())  # each call of main adds one that prints it
     assert "2 of 3 files are left out" in line
+
+
+def test_an_export_that_is_replaced(cli, tmp_path, shards):
+    """--overwrite leaves nothing of the export before, and touches no file that is not of it."""
+    first = shards.make(tmp_path / "a.h5", n=9)
+    assert cli("a.h5", "--to", "isaac-grasp", "--out", "made")[0] == 0
+    shards.make(tmp_path / "a.h5", n=4, objects=[shards.object("jug")])
+    assert cli("a.h5", "--to", "graspgen", "--out", "made")[0] == 2
+    (tmp_path / "made" / "notes.txt").write_text("mine")
+    code, _, err = cli("a.h5", "--to", "graspgen", "--out", "made", "--overwrite")
+    assert (code, "made holds notes.txt, which is not of the export" in err) == (2, True)
+    assert len(read_grasps(tmp_path / "made", "isaac-grasp").grasps) == len(first.grasps)
+    (tmp_path / "made" / "notes.txt").unlink()
+    assert cli("a.h5", "--to", "graspgen", "--out", "made", "--overwrite")[0] == 0
+    assert len(read_grasps(tmp_path / "made", "graspgen").grasps) == 4
+    assert not [path for path in (tmp_path / "made").rglob("*") if "cup" in path.name or path.suffix == ".yaml"]

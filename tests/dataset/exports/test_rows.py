@@ -225,3 +225,18 @@ def test_a_hand_that_cannot_be_used_is_named(tmp_path, shards):
             with pytest.raises(LgraspError, match=words):
                 export_shards(tmp_path / "a.h5", tmp_path / "out", form)
             assert not (tmp_path / "out").exists()
+
+
+def test_what_any_simulator_saw_fail(tmp_path, shards):
+    """Rows that held in one simulator and failed in another are no grasps that hold."""
+    shard = shards.make(tmp_path / "a.h5", holds=np.array([True, True, False, True, True, True]))
+    told = {"physx_fc_holds": np.array([True, False, True, True, True, True])}
+    physics = dict(shard.grasps.physics) | told
+    protocols = dict(shard.grasps.physics_protocols) | dict.fromkeys(told, "{}")
+    write_shard(
+        tmp_path / "a.h5", replace(shard, grasps=replace(shard.grasps, physics=physics, physics_protocols=protocols))
+    )
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "graspgen")
+    (file,) = (tmp_path / "out" / "grasps").glob("*.json")
+    held = json.loads(file.read_text())["grasps"]["object_in_gripper"]
+    assert held == [True, False, False, True, True, True]

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.report.diversity import Coverage, principal_postures
-from lgrasp.dataset.report.gather import EvenSample
+from lgrasp.dataset.report.gather import EvenSample, NearRows
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
 from lgrasp.dataset.report.write import read_dataset, report_dataset
 from lgrasp.dataset.writer import write_shard
@@ -197,6 +197,16 @@ def test_near_duplicates(make_shard, tmp_path):
     dropped = 300 - int(new_rows(shard.grasps.object_pose[:, 0], shard.grasps.q).sum())
     assert 50 < dropped < 250
     assert (near["compared"], near["duplicates"], near["share"]) == (300, dropped, dropped / 300)
+
+
+def test_poses_are_counted_once_wherever_their_rows_are():
+    """Shards are shuffled: rows of one pose are in every block."""
+    random = np.random.default_rng(0)
+    poses = random.normal(size=(5_000, 1, 7)).astype(np.float32)
+    rows, near = poses[random.integers(0, len(poses), 90_000)], NearRows(None)
+    for block in np.array_split(rows, 7):
+        near.add(block, block[:, 0])
+    assert near.poses == len(np.unique(rows[:, 0], axis=0))
 
 
 def test_several_objects_are_near_together(make_shard, tmp_path):
