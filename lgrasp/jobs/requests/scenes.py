@@ -52,7 +52,9 @@ class SceneRequest(Request):
                     f"objects {found[path.stem]} and {path} have one name, '{path.stem}'; rename one of the files"
                 )
         if self.grasps is not None:
-            given = [n for n in ("scale", "pipeline", "stock") if getattr(self, n) != type(self).model_fields[n].default]
+            given = [
+                n for n in ("scale", "pipeline", "stock") if getattr(self, n) != type(self).model_fields[n].default
+            ]
             if given:
                 notice(f"{', '.join(given)}: of no use, no grasps are generated beside those of {self.grasps}")
             shards_below(self.grasps)
