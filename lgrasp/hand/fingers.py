@@ -1,6 +1,7 @@
 """Names of a hand's fingers, the dependency groups that they stand for, and the human fingers that they act as."""
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import get_args
 
@@ -53,3 +54,26 @@ def finger_roles(spec: HandSpec, tree: Tree) -> Roles:
         f: tuple(sorted(own, key=lambda n: (tree.body_of(n), tree.link_names.index(n)))) for f, own in links.items()
     }
     return {role: (roles[role], outwards[roles[role]]) for role in get_args(Role) if outwards.get(roles.get(role, ""))}
+
+
+def roles_by_opposition(spec: HandSpec) -> dict[str, Role]:
+    """Roles of fingers whose names tell no thumb: it is the one that opposes most others, which follow in the order of
+    hand.yaml from the end where the thumb is.
+
+    Empty where a name tells it, hand.yaml does, or none opposes more than all others.
+    """
+    if spec.roles or len(spec.fingers) < 3 or any(re.search(_TOLD["thumb"], f.lower()) for f in spec.fingers):
+        return {}
+    opposed: dict[str, Counter[str]] = {finger: Counter() for finger in spec.fingers}
+    for side in (side for space in spec.opposition_spaces.values() for side in space.sides):
+        links = {link for part in side for link in part.links}
+        for finger in (name for name, own in spec.fingers.items() if links & {*own}):
+            opposed[finger][repr(side)] += 1
+    # a finger in a row meets its neighbours with other sides than the thumb
+    most = {finger: max(sides.values(), default=0) for finger, sides in opposed.items()}
+    thumb, second, *_ = sorted(most, key=lambda finger: -most[finger])
+    if most[thumb] == most[second]:
+        return {}
+    others = [f for f in spec.fingers if f != thumb]
+    last = 2 * [*spec.fingers].index(thumb) > len(others)
+    return dict(zip([thumb, *(others[::-1] if last else others)], get_args(Role), strict=False))

@@ -18,6 +18,7 @@ MOVABLE = {"revolute", "prismatic", "continuous"}
 """Types of joints that move."""
 
 _MOST_BYTES = 16 << 20
+_HARMLESS = ("}property", "}arg")  # elements of xacro that leave nothing out
 _MOST_PARTS = 8  # of a mesh's name that are looked for below other folders
 
 
@@ -160,6 +161,9 @@ def parse_robot(path: Path, raw: bytes) -> tuple[etree._Element, bytes]:
         raw = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
     if about.doctype:
         raise HandError(f"URDF {path} declares a DOCTYPE; entity declarations are not accepted, remove them")
+    macros = [e.tag for e in tree.iter() if isinstance(e.tag, str) and "/xacro}" in e.tag]
+    if macro := next((etree.QName(tag).localname for tag in macros if not tag.endswith(_HARMLESS)), None):
+        raise HandError(f"URDF {path} is xacro (xacro:{macro}): expand it first (xacro FILE > hand.urdf)")
     if tree.tag == "mujoco":
         raise HandError(f"URDF {path} is MJCF: make a hand of it with 'lgrasp hands add {path}', and use that")
     if tree.tag == "mujocoinclude":

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from lgrasp.math.constants import LEAST_INERTIA, LEAST_MASS
 from lgrasp.simulate.protocol import Physics, Protocol
-from lgrasp.simulate.solid import Solid
+from lgrasp.simulate.solid import LEAST_VOLUME, Solid
 
 ROLLING = 1.0e-4
 """Rolling friction [m]; contacts of dimension 4 have none."""
@@ -106,7 +106,8 @@ def add_table(mujoco: Any, spec: Any, name: str, physics: Physics) -> None:
 def add_hull(mujoco: Any, spec: Any, body: Any, vertices: np.ndarray, name: str) -> None:
     """Give a body the convex hull of vertices (V, 3) [m] to collide with; a sliver is left out."""
     try:
-        ConvexHull(vertices)
+        if ConvexHull(vertices).volume < LEAST_VOLUME:
+            return
     except QhullError:
         return
     mesh = spec.add_mesh(name=name, uservert=np.asarray(vertices, float).ravel())

@@ -23,7 +23,7 @@ _EFFORTS = ((1.5e-4, _ALLOWED_DENT, 180.0), (5.0e-4, 2 * _ALLOWED_DENT, 120.0))
 # tried in turn: surface details [m] that are smoothed away first, dents [m] that may stay filled, time [s]
 _HULL_ERROR = 2.0e-4  # corners of a piece that matter less than this [m] are left out; engines go through them all
 _FEW_CORNERS = 32  # of a piece that is left as it is
-_MIN_PIECE_VOLUME = 1.0e-11  # [m^3] a piece of less volume is left out
+LEAST_VOLUME = 1.0e-11  # [m^3] a piece of less volume is left out
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def _cut(mesh: trimesh.Trimesh, decompose: Decompose, detail: float, dent: float
             hull = ConvexHull(vertices)
         except QhullError:
             continue
-        if hull.volume > _MIN_PIECE_VOLUME:
+        if hull.volume > LEAST_VOLUME:
             pieces.append(vertices[hull.vertices])
     if not pieces:
         raise DecomposeError("convex decomposition gave slivers only")

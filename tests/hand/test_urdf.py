@@ -42,6 +42,7 @@ def mesh(name: str, scale: str = "") -> str:
 
 A, B, C = link("a"), link("b"), link("c")
 J = joint("j", "a", "b")
+XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 LAUGHS = "<!DOCTYPE robot [" + '<!ENTITY l0 "ha">'
 LAUGHS += "".join(f'<!ENTITY l{i} "{10 * f"&l{i - 1};"}">' for i in range(1, 12)) + "]>"
 
@@ -58,6 +59,7 @@ BAD = {
         "DOCTYPE|not XML",
     ),
     "external definition": (robot(A, B, J, head='<!DOCTYPE robot SYSTEM "http://127.0.0.1:9/x.dtd">'), "DOCTYPE"),
+    "xacro": (robot(A, B, J, f'<xacro:finger {XACRO} name="b"/>'), r"xacro:finger.*expand it first"),
     "too deep": ("<robot>" + 5000 * "<link>" + 5000 * "</link>" + "</robot>", "not XML"),
     "no links": (robot(), "root link|malformed"),
     "no movable joint": (robot(A, B, joint("j", "a", "b", kind="fixed")), "no movable joint"),

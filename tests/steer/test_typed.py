@@ -12,7 +12,7 @@ from support.places import ROOT
 from lgrasp.choices import ThumbPlace
 from lgrasp.errors import ConfigError, HandError
 from lgrasp.hand.find import find_hand
-from lgrasp.hand.fingers import finger_roles
+from lgrasp.hand.fingers import finger_roles, roles_by_opposition
 from lgrasp.hand.sides import posture_links
 from lgrasp.hand.spec import load_spec
 from lgrasp.hand.tree import build_tree
@@ -186,3 +186,22 @@ def test_roles_of_hand_yaml_and_of_names(tmp_path: Path):
     ):
         with pytest.raises(HandError, match=problem):
             load_spec(write(roles=roles))
+
+
+def test_the_thumb_of_fingers_without_names_opposes_the_others():
+    """As of hands whose links have numbers: the thumb is not the finger that comes first, nor the index."""
+    spec, tree = parts("allegro").spec, parts("allegro").tree
+    names = dict(zip(["one", "two", "three", "four"], spec.fingers.values(), strict=True))
+    pairs = dict(spec.opposition_spaces)
+    thumb = pairs["thumb-palm"].sides[1]
+    for finger in ("middle", "ring"):  # as a draft has them
+        sides = thumb, pairs[f"{finger}-palm"].sides[1]
+        pairs[f"thumb-{finger}"] = pairs["thumb-index"].model_copy(update={"sides": sides})
+    known = spec.model_copy(update={"fingers": names, "opposition_spaces": pairs, "roles": {}})
+    roles = roles_by_opposition(known)
+    assert roles == {"four": "thumb", "three": "index", "two": "middle", "one": "ring"}
+    acting = finger_roles(known.model_copy(update={"roles": roles}), tree)
+    assert {role: finger for role, (finger, _) in acting.items()} == {role: finger for finger, role in roles.items()}
+    assert roles_by_opposition(spec) == {}  # a name tells it
+    some = {name: space for name, space in pairs.items() if "thumb" not in name}
+    assert roles_by_opposition(known.model_copy(update={"opposition_spaces": some})) == {}

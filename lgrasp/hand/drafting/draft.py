@@ -22,6 +22,7 @@ from lgrasp.hand.drafting.finger_structure import (
 from lgrasp.hand.drafting.lateral_surfaces import rounded_axis
 from lgrasp.hand.drafting.propose import propose_spaces
 from lgrasp.hand.drafting.reach import Hold
+from lgrasp.hand.fingers import roles_by_opposition
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.spec import HandSpec
@@ -101,7 +102,12 @@ def draft_spec(
     else:
         model = replace(survey.model, tree=build_tree(urdf, spec))
     spaces, of_spaces = propose_spaces(urdf, spec, survey, names, model)
-    return spec.model_copy(update={"opposition_spaces": spaces}), [*decided, *of_spaces]
+    decided += of_spaces
+    spec = spec.model_copy(update={"opposition_spaces": spaces})
+    if roles := roles_by_opposition(spec):
+        acting = ", ".join(f"{finger} as {role}" for finger, role in roles.items())
+        decided.append(f"note: no name tells the thumb; by what opposes what and in order: {acting} (roles)")
+    return spec.model_copy(update={"roles": roles}), decided
 
 
 def _with_shared(urdf: Urdf, survey: ContactSurvey, spec: HandSpec, decided: list[str]) -> tuple[HandSpec, list[str]]:

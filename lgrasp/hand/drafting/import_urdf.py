@@ -29,10 +29,12 @@ from lgrasp.hand.names import name_of_file, slug
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
 from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, read_robot
 from lgrasp.paths import cache_dir, data_dirs, user_dir
+from lgrasp.words import listed
 
-_DRAFT_VERSION = 6
+_DRAFT_VERSION = 7
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
+_FEW = 8  # links that are named
 _MOST_OTHERS = 30  # files that are asked for couplings
 
 
@@ -189,7 +191,9 @@ def _write(robot: etree._Element, path: Path) -> None:
 def _take_visuals(robot: etree._Element) -> list[str]:
     """Where no link has collision geometry, the visual geometry is it."""
     visuals = list(robot.iter("visual"))
-    if not visuals or robot.find(".//collision") is not None:
+    if robot.find(".//collision") is not None:
+        return _ghosts(robot)
+    if not visuals:
         return []
     for visual in visuals:
         collision = etree.SubElement(visual.getparent(), "collision")
@@ -197,6 +201,28 @@ def _take_visuals(robot: etree._Element) -> list[str]:
         copies = (etree.fromstring(etree.tostring(part)) for part in visual if part.tag in ("origin", "geometry"))
         collision.extend(copies)
     return [f"no link has collision geometry: the visual geometry of {len(visuals)} elements is used as collision"]
+
+
+def _ghosts(robot: etree._Element) -> list[str]:
+    """A note on links that joints move and that can be seen, but touch nothing."""
+    solid = {link.get("name", "") for link in robot.iter("link") if link.find("collision") is not None}
+    seen = {link.get("name", "") for link in robot.iter("link") if link.find("visual") is not None}
+    moved = [joint.find("child").get("link", "") for joint in robot.iter("joint") if joint.get("type") in MOVABLE]
+    ghosts = [link for link in moved if link in seen and not solid & {*_rigid(robot, link)}]
+    if not ghosts:
+        return []
+    return [
+        f"note: {listed(ghosts, _FEW)}: visual geometry, but no <collision>: nothing touches there; copy <visual> to "
+        "<collision> if fingers should"
+    ]
+
+
+def _rigid(robot: etree._Element, link: str) -> Iterator[str]:
+    """A link and those that are fixed to it, below."""
+    yield link
+    for joint in robot.iter("joint"):
+        if joint.get("type") not in MOVABLE and joint.find("parent").get("link") == link:
+            yield from _rigid(robot, joint.find("child").get("link", ""))
 
 
 def _take_meshes(robot: etree._Element, folder: Path, find: FindMesh, originals: dict[Path, Path]) -> list[str]:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from lgrasp.hand.drafting.elements import number_text, set_origin
 from lgrasp.hand.drafting.mjcf_couplings import Follows, couplings, tendon_terms
 from lgrasp.hand.urdf import find_mesh
 from lgrasp.runtime.optional import import_mujoco
+from lgrasp.words import plural
 
 _SIDES = 32  # of a capsule
 
@@ -86,7 +88,7 @@ class _Writer:
         self._driven, self._pulled = self._drives()
         self._follows = couplings(model, self._joints, self._bodies, self._driven)
         self._names: set[str] = set()
-        self._files: dict[str, str] = {}
+        self._files: dict[tuple[str, int], str] = {}
 
     def _top(self, root: str | None) -> int:
         """The body that is the root link: ``root``, the one on the world that carries all joints, or the world."""
@@ -147,6 +149,7 @@ class _Writer:
         for b in self._bodies[1:]:
             self._add_joints(robot, b)
         self._note_drives()
+        self._note_passing()
         return robot
 
     def _add_inertia(self, link: etree._Element, b: int) -> None:
@@ -188,9 +191,9 @@ class _Writer:
         """Name of the file, written now, with the mesh of a geom [m]."""
         m, kinds, size = self._m, self._lib.mjtGeom, self._m.geom_size[g]
         kind, data = kinds(m.geom_type[g]), int(m.geom_dataid[g])
-        name = self._name("mesh", data) if data >= 0 else self._name("geom", g)
-        if name in self._files:
-            return self._files[name]
+        what = ("mesh", data) if data >= 0 else ("geom", g)
+        if what in self._files:
+            return self._files[what]
         if kind == kinds.mjGEOM_CAPSULE:
             mesh = trimesh.creation.capsule(2 * size[1], size[0], (_SIDES, _SIDES))
         elif kind == kinds.mjGEOM_ELLIPSOID:
@@ -199,11 +202,11 @@ class _Writer:
             v, f = m.mesh_vertadr[data], m.mesh_faceadr[data]
             vertices, faces = m.mesh_vert[v : v + m.mesh_vertnum[data]], m.mesh_face[f : f + m.mesh_facenum[data]]
             mesh = trimesh.Trimesh(vertices, faces, process=False)
-        file = f"{re.sub(r'[^A-Za-z0-9_-]+', '_', name)}.stl"
+        file = f"{re.sub(r'[^A-Za-z0-9_-]+', '_', self._name(*what))}.stl"
         while (self._folder / file).exists():
             file = f"_{file}"
         mesh.export(self._folder / file)
-        self._files[name] = file
+        self._files[what] = file
         return file
 
     def _add_joints(self, robot: etree._Element, b: int) -> None:
@@ -304,6 +307,28 @@ class _Writer:
         bare = [self._name("joint", j) for j in free if j not in drives]
         if drives and bare:
             self.notes.append(f"note: no actuator drives {', '.join(bare)}; {say}")
+
+    def _note_passing(self) -> None:
+        """Note links that never collide with each other in the file: here all links do."""
+        m, passing = self._m, []
+        excluded = {tuple(sorted(divmod(int(pair), 1 << 16))) for pair in m.exclude_signature}
+        paired = {tuple(sorted(m.geom_bodyid[list(pair)])) for pair in zip(m.pair_geom1, m.pair_geom2, strict=True)}
+        types = {}
+        for b in self._bodies:
+            own = slice(m.body_geomadr[b], m.body_geomadr[b] + m.body_geomnum[b])
+            types[b] = np.stack([m.geom_contype[own], m.geom_conaffinity[own]], 1)
+        for a, b in combinations([b for b in self._bodies if types[b].any()], 2):
+            weld_a, weld_b = m.body_weldid[a], m.body_weldid[b]
+            if weld_a == weld_b or m.body_weldid[m.body_parentid[weld_b]] == weld_a:  # neighbours never do
+                continue
+            meet = (types[a][:, None] & types[b][None, :, ::-1]).any()
+            if (a, b) in excluded or not (meet or (a, b) in paired):
+                passing.append(f"{self._name('body', a)} and {self._name('body', b)}")
+        if passing:
+            self.notes.append(
+                f"note: {plural(len(passing), 'pair')} of links pass through each other in the file, such as "
+                f"{passing[0]}; here all links collide, and grasps in which these do are refused"
+            )
 
 
 def _connect(

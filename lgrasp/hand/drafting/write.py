@@ -26,6 +26,7 @@ def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
         "palm": palm if spec.palm.links else ["palm: {}"],
         "open_posture": _mapping("open_posture", {n: f"{v:g}" for n, v in spec.open_posture.items()}),
         "fingers": ["fingers:", *(f"  {_plain(n)}: {_plain(list(links))}" for n, links in spec.fingers.items())],
+        "roles": _mapping("roles", dict(spec.roles)),
         "opposition_spaces": space_lines(spec.opposition_spaces),
     }
     template = files("lgrasp.hand.drafting").joinpath("hand.yaml.in").read_text(encoding="utf-8")

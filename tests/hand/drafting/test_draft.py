@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import trimesh
+from lxml import etree
 from support.places import ROOT
 from support.urdfs import BAR, PHALANX, fingers, gripper, rods
 
@@ -129,6 +130,22 @@ def test_visual_geometry_stands_in(tmp_path):
         draft_spec(path)
     made = import_urdf(path, out=tmp_path / "made")
     assert any("visual geometry of 3 elements is used as collision" in line for line in made.decisions)
+
+
+@pytest.mark.usefixtures("no_spaces")
+def test_links_that_touch_nothing_are_told(tmp_path):
+    """Fingertips with visual geometry alone; what is fixed to a link is a part of it."""
+    path = fingers(tmp_path, 2)
+    robot = etree.fromstring(path.read_bytes())
+    for collision in list(robot.iter("collision")):
+        if collision.getparent().get("name") in ("b0", "b1"):
+            collision.tag = "visual"
+    cap = '<link name="cap"><collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
+    held = '<joint name="cap" type="fixed"><parent link="b1"/><child link="cap"/></joint>'
+    path.write_bytes(etree.tostring(robot).replace(b"</robot>", (cap + held + "</robot>").encode()))
+    made = import_urdf(path, out=tmp_path / "made")
+    told = [line for line in made.decisions if "no <collision>" in line]
+    assert [line.split(":")[1] for line in told] == [" b0"]
 
 
 def test_one_finger_is_refused(tmp_path):

@@ -34,7 +34,7 @@ HAND = """
         <body name="one" pos="0 .04 .02" euler="90 0 15">
           <joint name="spread" axis="0 0 1" range="-20 20" ref="7"/>
           <joint name="bend" axis="1 0 0" pos="0 .01 -.004" range="-10 80" ref="-12"/>
-          <geom type="capsule" fromto="0 0 0 0 0 .05" size=".008"/>
+          <geom name="pad" type="capsule" fromto="0 0 0 0 0 .05" size=".008"/>
           <body name="tip one" pos="0 0 .055">
             <joint name="tip" axis="1 .2 0" range="0 80"/>
             <geom type="ellipsoid" size=".007 .008 .02" pos="0 0 .02"/>
@@ -56,6 +56,7 @@ HAND = """
       </body>
     </body>
   </worldbody>
+  <contact><exclude body1="tip one" body2="tip two"/><exclude body1="palm" body2="one"/></contact>
   <tendon>
     <fixed name="pair"><joint joint="bend" coef=".5"/><joint joint="tip" coef="-.25"/></fixed>
     <fixed name="shared"><joint joint="spread" coef="1"/><joint joint="turn" coef="1"/></fixed>
@@ -165,10 +166,14 @@ def test_geometry_and_masses_are_those_of_the_file(made):
         b = twin.body(name).id
         assert twin.body_mass[b] == pytest.approx(masses[name], rel=1e-6)
         assert np.sort(twin.body_inertia[b]) == pytest.approx(np.sort(model.body(name).inertia), rel=1e-5)
-    assert {k.removesuffix(".stl") for k in urdf.mesh_files} == {
-        "pad",
-        *(k[:-4] for k in urdf.mesh_files if "geom" in k),
-    }
+    assert (
+        {k.removesuffix(".stl") for k in urdf.mesh_files}
+        == {
+            "pad",
+            "_pad",  # a geom with the name of the mesh
+            *(k[:-4] for k in urdf.mesh_files if "geom" in k),
+        }
+    )
     assert urdf.text.count("<visual>") == 1
 
 
@@ -176,6 +181,7 @@ def test_what_the_file_leaves_open_is_told(made):
     _, notes, _ = made
     assert [line.split(";")[0] for line in notes] == [
         "note: one tendon drives spread, turn, which move each by itself here",
+        "note: 1 pair of links pass through each other in the file, such as tip one and tip two",
     ]
 
 
