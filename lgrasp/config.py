@@ -245,7 +245,7 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
             raise ConfigError(f"{where}: key '{key}' is missing") from None
         if not first["loc"]:
             raise ConfigError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
-        value = repr(first["input"])
+        value = repr(str(first["input"]) if isinstance(first["input"], Path) else first["input"])
         shown = value if len(value) <= 100 else f"{value[:97]}..."
         raise ConfigError(f"{where}: key '{key}' = {shown}: {_reason(first)}") from None
 

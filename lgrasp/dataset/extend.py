@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 
 from lgrasp.dataset.reader import open_hdf5, reading
+from lgrasp.dataset.structure import changed_texts, members
 from lgrasp.dataset.writer import create_rows, finish, new_shard_file
 from lgrasp.errors import ShardError
 
@@ -46,6 +47,8 @@ def extend_shard(
         f"metrics/{name}": (units or {}).get(name, "") for name in metrics or ()
     }
     with new_shard_file(out) as file, open_hdf5(source) as old, reading(source):
+        if problems := changed_texts(old, members(old)):  # the copy would vouch for them
+            raise ShardError(f"{source}: {problems[0]}")
         n = old["grasps/q"].shape[0]
         for name, values in columns.items():
             if values.shape[:1] != (n,) or (values.ndim > 1 and name.startswith("metrics/")):

@@ -13,7 +13,7 @@ import numpy as np
 
 from lgrasp.dataset.checks import hand_problems, object_problems
 from lgrasp.dataset.files import check_heaps, check_regular
-from lgrasp.dataset.structure import expand, format_problems, shard_problems
+from lgrasp.dataset.structure import changed_texts, expand, format_problems, shard_problems
 from lgrasp.errors import ShardError, short_reason
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows, Shard, ShardHeader
 from lgrasp.grasp.schema import CHUNK_ROWS, FORMAT, FORMAT_VERSION, GRASP_FIELDS, SEQUENCE_FIELDS, TABLE_FIELDS
@@ -109,7 +109,7 @@ class FileReader:
                 sha256=attrs["hand_sha256"],
                 meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
             )
-        self._require(check and hand_problems(record))
+        self._require(check and (changed_texts(self._file, nodes) or hand_problems(record)))
         return record
 
     def object(self, object_id: str, *, check: bool = True) -> ObjectRecord:

@@ -287,3 +287,14 @@ def text_sha256(nodes: Mapping[str, Any]) -> str:
     texts.pop("@text_sha256", None)
     document = json.dumps(texts, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(document.encode()).hexdigest()
+
+
+def changed_texts(file: h5py.File, nodes: Mapping[str, Any]) -> list[str]:
+    """The problem that attributes or texts of a file were changed, if they were; one without the checksum has none.
+
+    Args:
+        nodes: :func:`members` of the file.
+    """
+    if "text_sha256" not in file.attrs or file.attrs["text_sha256"] == text_sha256(nodes):
+        return []
+    return ["/: attributes or texts were changed after writing (text_sha256 differs)"]

@@ -9,7 +9,7 @@ import h5py
 from lgrasp.dataset.checks import hand_problems, object_problems, row_problems
 from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.reader import ShardReader, open_hdf5, reading
-from lgrasp.dataset.structure import shard_problems, text_sha256
+from lgrasp.dataset.structure import changed_texts, shard_problems
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import object_set_sha256
 
@@ -34,8 +34,7 @@ def file_problems(
         check_heaps(path)
         with open_hdf5(path) as file, reading(path):
             nodes, problems = structure(file)
-            if not problems and "text_sha256" in file.attrs and file.attrs["text_sha256"] != text_sha256(nodes):
-                problems = ["/: attributes or texts were changed after writing (text_sha256 differs)"]
+            problems = problems or changed_texts(file, nodes)
         return problems or content(path)
     except ShardError as error:
         return [str(error).removeprefix(f"{path}: ")]

@@ -20,6 +20,7 @@ RETREATS = wp.constant(7)
 """Directions in which the hand is tried to leave."""
 
 _STEPS = wp.constant(15)
+_PARTS = wp.constant(8)  # of the way from q_pregrasp to q
 _LEAST_SINE = wp.constant(1.0e-3)
 
 
@@ -122,12 +123,45 @@ def try_retreats(
 
 
 @wp.kernel
+def close_above(
+    hand: Hand,
+    obj: Object,
+    limits: Limits,
+    at: CheckedPostures,
+    row: wp.array(dtype=wp.int32),
+    packed: Packed,
+    under_out: wp.array(dtype=wp.int32),
+):
+    """One thread per (group, row kept): does the finger stay above the table on its way from ``q_pregrasp`` to ``q``?
+
+    Args:
+        row: (m,) hand of each row, -1 none.
+        under_out: (m,) 1: a finger does not; of zeros.
+    """
+    g, i = wp.tid()
+    s = row[i]
+    if s < 0:
+        return
+    q = at.posture[s, g]
+    x = group_dofs(hand.kin, g, packed.q_pregrasp, i)
+    plane = resting_plane(obj, at.pose[at.of[s]], at.resting[at.of[s]])
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    for part in range(1, _PARTS):
+        group_forward(hand.kin, g, x + (float(part) / float(_PARTS)) * (q - x), X, hand.kin.joint_first[g])
+        for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
+            if body_height(hand.pieces, 1 + j, X[j], plane, limits.min_table_distance) < limits.min_table_distance:
+                under_out[i] = 1
+                return
+
+
+@wp.kernel
 def choose_approach(
     obj: Object,
     palm: Palm,
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
     clear: wp.array(dtype=wp.int32),
+    under: wp.array(dtype=wp.int32),
     packed_out: Packed,
     counts_out: wp.array(dtype=wp.int32),
 ):
@@ -136,6 +170,7 @@ def choose_approach(
     Args:
         row: (m,) hand of each row, -1 none.
         clear: (m,) bit k: retreat k is clear.
+        under: (m,) 1: a finger that closes is not above the table.
         counts_out: (reasons,) rows without a way are moved from those that are kept.
     """
     i = wp.tid()
@@ -148,7 +183,7 @@ def choose_approach(
     packed_out.resting[i] = pose
     packed_out.approach[i] = wp.vec3(wp.nan, wp.nan, wp.nan)
     for k in range(RETREATS):
-        if (clear[i] >> k) & 1 == 1:
+        if (clear[i] >> k) & 1 == 1 and under[i] == 0:
             packed_out.approach[i] = -retreat(palm, up, wp.transform_point(T, obj.com), k)
             return
     wp.atomic_sub(counts_out, Outcome.KEPT, 1)

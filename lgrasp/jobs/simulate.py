@@ -38,7 +38,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
     """Adds verdicts of a physics simulation to shards, in place or to copies."""
 
     command: ClassVar[str] = "simulate"
-    version: ClassVar[int] = 7
+    version: ClassVar[int] = 8
 
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)

@@ -168,11 +168,17 @@ class RowChecks:
         good, hand = self.good, self.hand
         pose, back = self.table["pose"][good].astype(int), -self.table["approach"][good]
         T_open = hand.forward(self._full("q_pregrasp"), len(good))
+        ends = self._full("q_pregrasp"), self._full("q")
+        T_closing = [
+            hand.forward({name: (1 - t) * ends[0][name] + t * ends[1][name] for name in ends[0]}, len(good))
+            for t in bounds.CLOSING
+        ]
         found = np.zeros((3, len(good)))
         for k, obj in enumerate(self.shard.objects):
             m = np.flatnonzero(self.index[good, 0] == k)
             planes = self.shard.tables[k][pose[m]]
-            found[:, m] = on_table(hand, obj, planes, T_objects[m], T_links[m], T_open[m], back[m])
+            closing = [T[m] for T in (T_links, *T_closing)]
+            found[:, m] = on_table(hand, obj, planes, T_objects[m], closing, T_open[m], back[m])
         if self.shard.asked and self.shard.asked.plane is not None:
             found[1] = 0.0  # a plane that a user asks for need not touch the object
         for check, value in zip(("table", "resting", "approach"), found, strict=True):

@@ -187,7 +187,7 @@ def on_table(
     obj: JudgedObject,
     planes: np.ndarray,
     T_object: np.ndarray,
-    T_links: np.ndarray,
+    T_closing: Sequence[np.ndarray],
     T_open: np.ndarray,
     back: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -195,19 +195,20 @@ def on_table(
 
     Args:
         planes: that the object rests on: unit normal up, height along it [m], any more; object's frame, shape [n, 5].
-        T_object, T_links, T_open: poses of the object, of the links at the grasp and of those of the open hand, base
-            frame, shapes [n, 4, 4] and [n, L, 4, 4].
+        T_object, T_open: poses of the object and of the links of the open hand, base frame, shapes [n, 4, 4] and
+            [n, L, 4, 4].
+        T_closing: of the links at the grasp and while they close, in any order.
         back: direction in which the open hand leaves, base frame, shape [n, 3].
 
     Returns:
-        Depth of the lowest point of any link below the plane, at the grasp, open, and at the start of the way; distance
+        Depth of the lowest point of any link below the plane, closing, open, and at the start of the way; distance
         of the object's lowest point from the plane; deepest penetration of open hand and object on the way [m], (n,).
     """
     back = back / np.linalg.norm(back, axis=1, keepdims=True)
     up = np.einsum("nij,nj->ni", T_object[:, :3, :3], planes[:, :3])
     height = planes[:, 3] + np.einsum("ni,ni->n", up, T_object[:, :3, 3])
     start = _moved(T_open, bounds.APPROACH_LENGTH * back)
-    below = np.max([_below(hand, T, up, height) for T in (T_links, T_open, start)], axis=0)
+    below = np.max([_below(hand, T, up, height) for T in (*T_closing, T_open, start)], axis=0)
     gap = np.abs((obj.mesh.vertices @ planes[:, :3].T).min(axis=0) - planes[:, 3])
     into, depth = np.linalg.inv(T_object)[:, None], np.zeros(len(back))
     ways = np.arange(0.0, bounds.APPROACH_LENGTH + 1e-9, bounds.APPROACH_STEP)

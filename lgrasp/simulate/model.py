@@ -16,6 +16,7 @@ from lgrasp.simulate.protocol import Protocol
 from lgrasp.simulate.scene import Scene
 
 _NEAR_DISTANCE = 1.0e-3  # [m]
+_TABLE_TOLERANCE = 1.0e-12  # of the solver, with a table
 
 
 class TableBody(NamedTuple):
@@ -103,8 +104,8 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
                 geom.margin = _NEAR_DISTANCE
         near = spec.compile()
         if protocol.table:
-            for made in (model, near):  # the solver's tolerance is as without a table
-                made.stat.meaninertia = np.delete(made.dof_M0, _table_of(made).velocity).mean()
+            for made in (model, near):  # it is relative to all bodies, and the table is heavy
+                made.opt.tolerance = _TABLE_TOLERANCE
     except (ValueError, KeyError, RuntimeError) as error:
         names = ", ".join(f"'{solid.name}'" for solid in solids)
         raise PhysicsError(

@@ -153,6 +153,12 @@ class Steering(Params):
     def _names(cls, value: Any) -> Any:
         return tuple(name.strip() for name in value.split(",")) if isinstance(value, str) else value
 
+    @model_validator(mode="after")
+    def _once(self) -> Self:
+        if len(self.sides) < len(self.links):
+            raise ValueError("links: one is named twice; name each once, with one side at most")
+        return self
+
     @property
     def sides(self) -> dict[str, SideName | None]:
         """Each of the links, and the side that touches; None: its contact surface."""

@@ -11,6 +11,7 @@ from lgrasp.errors import ConfigError, short_reason
 from lgrasp.geometry.poses import canonical, inverse, pose_from_matrix
 
 _UNIT = 1e-3  # of the lengths of quaternions, and of the products of the axes of a matrix
+_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _DIGITS = 7  # of equal poses
 _FARTHEST = 10.0  # [m] of an object from its hand, along an axis
 
@@ -72,6 +73,20 @@ def _read(path: Path) -> tuple[np.ndarray, bool]:
             raise ValueError(f"it has {', '.join(found.files)}; an array T_hand_object or T_object_hand is needed")
         return found[names[0]], names[0] == "T_object_hand"
     lines = [line for line in data.decode("utf-8").splitlines() if line.strip()]
-    if lines and any(c.isalpha() and c not in "eE" for c in lines[0]):  # a header
-        lines = lines[1:]
-    return np.atleast_2d(np.array([[float(x) for x in line.split(",")] for line in lines])), False
+    columns = range(len(_COLUMNS))
+    if lines and not any(map(_is_number, lines[0].split(","))):  # a header
+        names = [name.strip().lower() for name in lines.pop(0).split(",")]
+        if {*names} & {*_COLUMNS}:
+            if sorted(names) != sorted(_COLUMNS):
+                raise ValueError(f"its columns are {', '.join(names)}; give {', '.join(_COLUMNS)}")
+            columns = [names.index(name) for name in _COLUMNS]
+    rows = np.atleast_2d(np.array([[float(x) for x in line.split(",")] for line in lines]))
+    return rows[:, columns] if rows.shape[1] == len(_COLUMNS) else rows, False
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -49,7 +49,8 @@ def test_hands_are_above_the_table(on_table, solids, link_poses):
     height = plane[:, 3] + np.einsum("ni,ni->n", up, T[:, :3, 3])
     back = -rows.table["approach"]
     assert (np.einsum("ni,ni->n", back, up) > -1e-5).all()
-    for q, way in ((rows.q, 0.0), (rows.q_pregrasp, 0.0), (rows.q_pregrasp, 0.15)):
+    closing = [(rows.q_pregrasp + t * (rows.q - rows.q_pregrasp), 0.0) for t in np.linspace(0, 1, 9)]
+    for q, way in (*closing, (rows.q_pregrasp, 0.15)):
         links = link_poses(q)
         for solid in solids.solids:
             L = links[:, solid.link]

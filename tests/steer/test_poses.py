@@ -32,3 +32,21 @@ def test_files_that_are_none(tmp_path, name):
     (tmp_path / name).write_bytes(b"PK\x03\x04 nonsense")
     with pytest.raises(LgraspError, match=name):
         read_poses(tmp_path / name)
+
+
+def test_columns_of_a_table_with_a_header_go_by_their_names(tmp_path):
+    """Whatever their order; without names they are x y z qw qx qy qz."""
+    path = tmp_path / "poses.csv"
+    for order in ([0, 1, 2, 3, 4, 5, 6], [0, 1, 2, 4, 5, 6, 3], [3, 4, 5, 6, 0, 1, 2]):
+        names = [("x", "y", "z", "qw", "qx", "qy", "qz")[k] for k in order]
+        rows = "\n".join(",".join(f"{row[k]}" for k in order) for row in POSES)
+        path.write_text(f"{','.join(names)}\n{rows}\n")
+        np.testing.assert_array_equal(read_poses(path), POSES)
+    path.write_text("\n".join(",".join(map(str, row)) for row in POSES))
+    np.testing.assert_array_equal(read_poses(path), POSES)
+    path.write_text("nan,0,0,1,0,0,0\n0,0,0.1,1,0,0,0\n")
+    with pytest.raises(ConfigError, match="pose 0 is not finite"):
+        read_poses(path)
+    path.write_text("x,y,z,qw,qx,qy\n0,0,0.1,1,0,0\n")
+    with pytest.raises(ConfigError, match="its columns are x, y, z, qw, qx, qy; give x, y, z, qw, qx, qy, qz"):
+        read_poses(path)

@@ -23,7 +23,7 @@ from lgrasp.stages.filter.posture_kernels import (
     tell_postures,
 )
 
-VERSION = 14
+VERSION = 15
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:
