@@ -297,4 +297,5 @@ def changed_texts(file: h5py.File, nodes: Mapping[str, Any]) -> list[str]:
     """
     if "text_sha256" not in file.attrs or file.attrs["text_sha256"] == text_sha256(nodes):
         return []
-    return ["/: attributes or texts were changed after writing (text_sha256 differs)"]
+    changed = "/: attributes or texts were changed after writing (text_sha256 differs)"
+    return [f"{changed}; delete that attribute if they are yours"]

@@ -186,4 +186,7 @@ def test_what_may_be_is_accepted(path):
 def test_changed_text_is_noticed(path):
     with h5py.File(path, "r+") as file:
         file["hand/urdf"][()] = file["hand/urdf"].asstr()[()].replace("toy", "boy")
-    assert validate_shard(path) == ["/: attributes or texts were changed after writing (text_sha256 differs)"]
+    assert validate_shard(path) == [
+        "/: attributes or texts were changed after writing (text_sha256 differs); "
+        "delete that attribute if they are yours"
+    ]

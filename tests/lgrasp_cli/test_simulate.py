@@ -353,6 +353,10 @@ def test_what_a_shard_holds_besides_is_copied(cli, grasps, tmp_path):
     path = grasps / "jaws-cube-00000.h5"
     with h5py.File(path, "a") as file:
         file.create_group("notes").attrs["by"] = "someone"
+    assert "delete that attribute if they are yours" in cli("simulate", path, "--out", tmp_path / "out").error()
+    assert not (tmp_path / "out").exists()
+    with h5py.File(path, "a") as file:
+        del file.attrs["text_sha256"]
     assert cli("simulate", path, "--out", tmp_path / "out").code == 0
     with h5py.File(tmp_path / "out" / path.name) as file:
         assert file["notes"].attrs["by"] == "someone"

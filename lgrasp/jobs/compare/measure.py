@@ -40,8 +40,10 @@ def measure_cell(path: Path, protocol: ProtocolName | None) -> dict[str, Any]:
     with ShardReader(path, invalid=False) as reader:
         rows, statistics = len(reader), reader.statistics
         strict = strict_rows(reader.column, reader.header.config)
-        kept = last_survivors(stage_counts(statistics))
-        tried, seconds = int(statistics.get("candidates", 0)), float(statistics.get("seconds_wall", 0.0))
+        counts = stage_counts(statistics)
+        kept, seconds = last_survivors(counts), float(statistics.get("seconds_wall", 0.0))
+        # poses near those that gave grasps (close.moves) are no candidates
+        tried = max(int(statistics.get("candidates", 0)), counts.get("place", {}).get("tried", 0))
         found: dict[str, Any] = {"rows": rows} | dict.fromkeys([*MEANS, "pca_ratio", "joint_entropy"])
         found |= {"approach": 0.0, "surface": 0.0, "strict_per_s": strict / seconds if seconds else None}
         found["yield"] = kept * (strict / rows if rows else 0.0) / tried if tried else None

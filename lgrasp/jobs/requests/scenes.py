@@ -13,7 +13,6 @@ from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
-from lgrasp.notices import notice
 from lgrasp.object.find import find_object
 from lgrasp.scenes.params import SceneParams
 
@@ -52,11 +51,6 @@ class SceneRequest(Request):
                     f"objects {found[path.stem]} and {path} have one name, '{path.stem}'; rename one of the files"
                 )
         if self.grasps is not None:
-            given = [
-                n for n in ("scale", "pipeline", "stock") if getattr(self, n) != type(self).model_fields[n].default
-            ]
-            if given:
-                notice(f"{', '.join(given)}: of no use, no grasps are generated beside those of {self.grasps}")
             shards_below(self.grasps)
         elif not self.objects:
             raise ConfigError("no objects: name some (lgrasp objects list), or give a folder of shards with --grasps")

@@ -27,6 +27,7 @@ from lgrasp.jobs.records import cutter
 from lgrasp.jobs.requests.scenes import SceneRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import mesh_hash, object_of_shard
+from lgrasp.notices import notice
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.find import find_object
 from lgrasp.object.load import load_mesh
@@ -46,6 +47,9 @@ class Stock:
     items: tuple[Item, ...]
     """Sorted by id."""
     key: str
+
+
+_GENERATING = ("scale", "pipeline", "stock")  # what is asked of grasps that are generated
 
 
 class SceneJob(SceneRequest, Job):
@@ -173,6 +177,9 @@ def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Event
         digest.update(mesh_hash(part.record).encode())
         for values in columns.values():
             digest.update(np.ascontiguousarray(values).tobytes())
+    unused = [n for n in _GENERATING if getattr(config, n) != type(config).model_fields[n].default]
+    if config.grasps and unused:
+        notice(f"{', '.join(unused)}: of no use, no grasps are generated beside those of {config.grasps}")
     return Stock(upload_hand(hand, device.alias), record, tuple(items), digest.hexdigest())
 
 
