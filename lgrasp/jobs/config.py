@@ -36,7 +36,7 @@ from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object, list_objects, mesh_files
 from lgrasp.steer.params import Steering
 
-_OF_SINGLE = ("batch", "negatives", "passes", "scale", "simulate", "table")  # keys for one object a grasp
+_OF_SINGLE = {"batch", "negatives", "passes", "scale", "simulate", "table"}  # keys for one object a grasp
 
 
 class JobConfig(Params):
@@ -80,10 +80,9 @@ class JobConfig(Params):
     def _has_objects(self) -> "JobConfig":
         if not self.objects and not self.object_dir and not self.sequences:
             raise ValueError("objects: name at least one")
-        for name in _OF_SINGLE if self.sequences else ():
-            if getattr(self, name) != type(self).model_fields[name].default:
-                told = "a key of 'sequences'" if name in SequenceSets.model_fields else "no key"
-                raise ValueError(f"{name}: of sequences it is {told}")
+        if self.sequences and (unfit := self.model_dump(include=_OF_SINGLE, exclude_defaults=True)):
+            told = "a key of 'sequences'" if min(unfit) in SequenceSets.model_fields else "no key"
+            raise ValueError(f"{min(unfit)}: of sequences it is {told}")
         return self
 
 

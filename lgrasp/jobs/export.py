@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lgrasp.dataset.conditions import parse_condition
-from lgrasp.dataset.exports.folder import clear
+from lgrasp.dataset.exports.folder import INDEX
 from lgrasp.dataset.exports.formats import FORMATS, export_shards
 from lgrasp.dataset.exports.selection import chosen_rows, number_columns, verdict_columns
 from lgrasp.dataset.gather import gather
@@ -24,8 +24,6 @@ from lgrasp.errors import OutputError
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.schema import TABLE_FIELDS
 from lgrasp.jobs.requests.shards import ExportRequest
-
-_INDEX = "export.json"  # the last file of an export: one without it is not whole
 
 
 class ExportJob(ExportRequest, Job):
@@ -51,7 +49,7 @@ class ExportJob(ExportRequest, Job):
 
     def parts(self) -> list[Part]:
         tell_differences(self.shards)
-        return [Part(0, self.out / _INDEX)]
+        return [Part(0, self.out / INDEX)]
 
     def present(self, parts: Sequence[Part]) -> dict[int, int]:
         if not parts or not parts[0].file.is_file():
@@ -72,8 +70,8 @@ class ExportJob(ExportRequest, Job):
         def advance(done: int, total: int) -> None:
             replace(progress, part=replace(part, rows=total))(done)
 
-        clear(self.out)  # where it is to be replaced: it stays otherwise
-        done = export_shards(self.shards, self.out, self.to, advance=advance, **how)
+        # a whole one is only here if it is to be replaced
+        done = export_shards(self.shards, self.out, self.to, advance=advance, replaces=True, **how)
         return Made(done.rows, (), list(done.objects))
 
     def write(self, part: Part, contents: Any) -> None:

@@ -167,11 +167,10 @@ class RowChecks:
         """The hand above the table at the grasp, before it and along the way; the way clear of the object."""
         good, hand = self.good, self.hand
         pose, back = self.table["pose"][good].astype(int), -self.table["approach"][good]
-        T_open = hand.forward(self._full("q_pregrasp"), len(good))
-        ends = self._full("q_pregrasp"), self._full("q")
+        before, q = self._full("q_pregrasp"), self._full("q")
+        T_open = hand.forward(before, len(good))
         T_closing = [
-            hand.forward({name: (1 - t) * ends[0][name] + t * ends[1][name] for name in ends[0]}, len(good))
-            for t in bounds.CLOSING
+            hand.forward({name: (1 - t) * before[name] + t * q[name] for name in q}, len(good)) for t in bounds.CLOSING
         ]
         found = np.zeros((3, len(good)))
         for k, obj in enumerate(self.shard.objects):

@@ -49,28 +49,32 @@ UNFINISHED = "unfinished.json"
 _FEW = 8  # names in the README
 
 
-def clear(out: Path) -> None:
-    """Remove the whole export that a folder holds, if it holds one.
+def whole_export(out: Path) -> list[Path]:
+    """The files of the whole export that a folder holds; none if it holds none.
 
     Raises:
         OutputError: It holds other files, too.
     """
     try:
-        listed_files = json.loads((out / INDEX).read_bytes())["files"]
-        known = {out / name for name in listed_files} | {out / INDEX}
+        known = {out / name for name in json.loads((out / INDEX).read_bytes())["files"]} | {out / INDEX}
     except (OSError, ValueError, KeyError, TypeError):
-        return
+        return []
     there = _files(out)
     if other := sorted(path.name for path in there if path not in known):
         raise OutputError(f"{out} holds {other[0]}, which is not of the export; move it, or choose another --out")
-    for path in there:
+    return there
+
+
+def remove(out: Path, files: Sequence[Path]) -> None:
+    """Remove all files of a folder, and the folders in it."""
+    for path in files:
         path.unlink()
     for folder in sorted((path for path in out.rglob("*") if path.is_dir()), reverse=True):
         folder.rmdir()
 
 
 def _files(out: Path) -> list[Path]:
-    """All files of an export, with their folders."""
+    """All files of a folder of any depth."""
     return [path for path in out.rglob("*") if path.is_file() or path.is_symlink()]
 
 

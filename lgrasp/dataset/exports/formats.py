@@ -11,7 +11,16 @@ from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.card import publish
 from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
-from lgrasp.dataset.exports.folder import abandon, begin, check_empty, readme, write_assets, write_index
+from lgrasp.dataset.exports.folder import (
+    abandon,
+    begin,
+    check_empty,
+    readme,
+    remove,
+    whole_export,
+    write_assets,
+    write_index,
+)
 from lgrasp.dataset.exports.graspgen import GRASPGEN_NOTES, read_graspgen, write_graspgen
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
@@ -82,6 +91,7 @@ def export_shards(
     cut: Cut | None = None,
     advance: Callable[[int, int], None] | None = None,
     run_key: str = "",
+    replaces: bool = False,
 ) -> Exported:
     """Write grasps of shards, all of one hand, into a folder in the format of another program.
 
@@ -102,6 +112,7 @@ def export_shards(
         advance: Called with rows done and rows in all.
         run_key: Of the shards and options, to tell a later run that the export, whole or not, is its own; without it an
             export that was interrupted cannot be gone on with.
+        replaces: A whole export that the folder holds goes when the first file of this one is written.
 
     Raises:
         ConfigError: An unknown format, a condition or split that cannot be read, a limit below 1, a licence that is no
@@ -115,7 +126,9 @@ def export_shards(
     to = to.replace("_", "-")
     form, conditions, out = _format(to), [parse_condition(text) for text in where], Path(out)
     check_options(to, split, licence)
-    check_empty(out, run_key)
+    before = whole_export(out) if replaces else []
+    if not before:
+        check_empty(out, run_key)
     parts = Split.read(split) if split is not None else None
     selection = select_rows(paths, where=conditions, limit=limit, single=form.single, split=parts)
     selection = replace(selection, hand=form.hand(selection.hand))
@@ -130,6 +143,8 @@ def export_shards(
         if advance:
             advance(done, selection.rows)
 
+    if before:
+        remove(out, before)
     begin(out, run_key)
     try:
         write_assets(out, selection)

@@ -49,9 +49,6 @@ class Stock:
     key: str
 
 
-_GENERATING = ("scale", "pipeline", "stock")  # what is asked of grasps that are generated
-
-
 class SceneJob(SceneRequest, Job):
     """Scenes of one hand, one a file."""
 
@@ -177,7 +174,7 @@ def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Event
         digest.update(mesh_hash(part.record).encode())
         for values in columns.values():
             digest.update(np.ascontiguousarray(values).tobytes())
-    unused = [n for n in _GENERATING if getattr(config, n) != type(config).model_fields[n].default]
+    unused = config.model_dump(include={"scale", "pipeline", "stock"}, exclude_defaults=True)
     if config.grasps and unused:
         notice(f"{', '.join(unused)}: of no use, no grasps are generated beside those of {config.grasps}")
     return Stock(upload_hand(hand, device.alias), record, tuple(items), digest.hexdigest())

@@ -193,6 +193,9 @@ def test_an_export_that_is_replaced(cli, tmp_path, shards):
     assert (code, "made holds notes.txt, which is not of the export" in err) == (2, True)
     assert len(read_grasps(tmp_path / "made", "isaac-grasp").grasps) == len(first.grasps)
     (tmp_path / "made" / "notes.txt").unlink()
+    code, _, err = cli("a.h5", "--to", "graspgen", "--out", "made", "--overwrite", "--where", "metrics/epsilon > 99")
+    assert (code, "none satisfies" in err) == (2, True)
+    assert len(read_grasps(tmp_path / "made", "isaac-grasp").grasps) == len(first.grasps)
     assert cli("a.h5", "--to", "graspgen", "--out", "made", "--overwrite")[0] == 0
     assert len(read_grasps(tmp_path / "made", "graspgen").grasps) == 4
     assert not [path for path in (tmp_path / "made").rglob("*") if "cup" in path.name or path.suffix == ".yaml"]
