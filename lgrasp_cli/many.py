@@ -35,6 +35,7 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
         for number, (request, own) in enumerate(zip(requests, each, strict=True), 1):
             if not how.quiet:
                 typer.echo(f"[{number}/{len(each)}] {request.title}", err=True)
+            how.cache.more_jobs = number < len(each)
             results.append(_run_one(request, own))
             if results[-1]["exit_code"] == 130:
                 break

@@ -47,6 +47,7 @@ def measure(
             rows = job.rows if turn else max(1, min(_PROBE_ROWS, job.rows // 10))
             what = f"run {turn}/{repeat}" if turn else "untimed"
             say(f"{what}: {job.pipeline.name}, {Path(job.object).stem}, {rows:,} rows")
+            cache.more_jobs = (turn, number) != (repeat, len(jobs) - 1)
             data, rate = _run(job.changed(rows=rows, cache=cache), built)
             jobs[number] = job.changed(rate=rate)
             runs[number] += [data] if turn else []

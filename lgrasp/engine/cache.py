@@ -66,6 +66,8 @@ class Cache:
         self._stored: set[Path] = set()
         self.kept = Keeper()
         """What jobs of this process share in memory."""
+        self.more_jobs = False
+        """Whether other jobs follow: processes that they may use are kept for them."""
         self.warn = warn or (lambda line: None)
         self._writable = True
         if os.path.exists(self.root) and not os.path.isdir(self.root):

@@ -9,6 +9,7 @@ from lgrasp.grasp.outcomes import Outcome
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_dofs, group_forward
 from lgrasp.math.limits import MAX_BODIES
+from lgrasp.math.sdf import sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -17,9 +18,10 @@ wp.set_module_options(KERNEL_OPTIONS)
 APPROACH_LENGTH = 0.15
 """Way of the open hand to the grasp [m]."""
 RETREATS = wp.constant(7)
-"""Directions in which the hand is tried to leave."""
+"""Directions in which the hand is tried to leave, by this order."""
 
-_STEPS = wp.constant(15)
+_STEPS = wp.constant(50)  # of the way, 3 mm each
+_SURE = wp.constant(1.0e-3)  # [m] of a distance in a grid
 _PARTS = wp.constant(8)  # of the way from q_pregrasp to q
 _LEAST_SINE = wp.constant(1.0e-3)
 
@@ -78,8 +80,41 @@ def check_table(hand: Hand, obj: Object, limits: Limits, part: wp.int32, at: Che
         found_out.outcome[i] = Outcome.TABLE
 
 
+@wp.func
+def _body_pose(hand: Hand, b: wp.int32, q: wp.array2d(dtype=wp.float32), row: wp.int32):
+    """T_base_body of body b with row ``row`` of q (N, K)."""
+    if b == 0:
+        return wp.transform_identity()
+    g = hand.body_group[b]
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    first = group_forward(hand.kin, g, group_dofs(hand.kin, g, q, row), X, 0)
+    return X[b - 1 - first]
+
+
+@wp.func
+def _way_blocked(hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.transform, way: wp.vec3):
+    """True if a body comes too deep into the object on the way from T = T_object_body by ``way`` (object's frame)."""
+    ball = hand.pieces.body_sphere[b]
+    if ball[3] < 0.0:
+        return False
+    centre = wp.transform_point(T, wp.vec3(ball[0], ball[1], ball[2]))
+    length = APPROACH_LENGTH / float(_STEPS)
+    step = int(1)
+    while step <= _STEPS:
+        by = way * (length * float(step))
+        clear = sdf_value(obj.sdf, centre + by) - ball[3] - _SURE
+        if clear > 0.0:
+            step += wp.max(1, int(clear / length))  # it cannot touch before
+        else:
+            moved = wp.transform(wp.transform_get_translation(T) + by, wp.transform_get_rotation(T))
+            if body_depth(hand, obj, b, moved, limits.max_penetration) > limits.max_penetration:
+                return True
+            step += 1
+    return False
+
+
 @wp.kernel
-def try_retreats(
+def try_retreat(
     hand: Hand,
     obj: Object,
     limits: Limits,
@@ -87,39 +122,27 @@ def try_retreats(
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
     packed: Packed,
-    clear_out: wp.array(dtype=wp.int32),
+    k: wp.int32,
+    blocked_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per (row kept, retreat): does the open hand leave that way, not downwards, and clear of the object?
-
-    Retreats after one that is clear may be left out.
+    """One thread per (body, row kept): can the open hand not leave by retreat k, as that is downwards or a body would
+    come into the object? Rows that can leave by one before are left out.
 
     Args:
         row: (m,) hand of each row, -1 none.
-        clear_out: (m,) bit k: retreat k is; of zeros.
+        blocked_out: (m,) bit k: retreat k is; bits of those before are there.
     """
-    i, k = wp.tid()
+    b, i = wp.tid()
     s = row[i]
-    if s < 0 or clear_out[i] & ((1 << k) - 1) != 0:
+    if s < 0 or blocked_out[i] & ((1 << k) - 1) != (1 << k) - 1 or (blocked_out[i] >> k) & 1 == 1:
         return
     T = at.pose[at.of[s]]
     up = wp.transform_vector(T, obj.resting.up[at.resting[at.of[s]]])
     way = retreat(palm, up, wp.transform_point(T, obj.com), k)
-    if wp.dot(way, up) < 0.0:
-        return
-    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    for g in range(hand.kin.groups):
-        group_forward(hand.kin, g, group_dofs(hand.kin, g, packed.q_pregrasp, i), X, hand.kin.joint_first[g])
     T_object = wp.transform_inverse(T)
-    bodies = hand.body_group.shape[0]
-    for step in range(_STEPS):
-        moved = wp.transform(way * (APPROACH_LENGTH * float(step + 1) / float(_STEPS)), wp.quat_identity())
-        for b in range(bodies):
-            B = moved
-            if b > 0:
-                B = moved * X[b - 1]
-            if body_depth(hand, obj, b, T_object * B, limits.max_penetration) > limits.max_penetration:
-                return
-    wp.atomic_or(clear_out, i, 1 << k)
+    B = T_object * _body_pose(hand, b, packed.q_pregrasp, i)
+    if wp.dot(way, up) < 0.0 or _way_blocked(hand, obj, limits, b, B, wp.transform_vector(T_object, way)):
+        wp.atomic_or(blocked_out, i, 1 << k)
 
 
 @wp.kernel
@@ -160,7 +183,7 @@ def choose_approach(
     palm: Palm,
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
-    clear: wp.array(dtype=wp.int32),
+    blocked: wp.array(dtype=wp.int32),
     under: wp.array(dtype=wp.int32),
     packed_out: Packed,
     counts_out: wp.array(dtype=wp.int32),
@@ -169,7 +192,7 @@ def choose_approach(
 
     Args:
         row: (m,) hand of each row, -1 none.
-        clear: (m,) bit k: retreat k is clear.
+        blocked: (m,) bit k: the hand cannot leave by retreat k.
         under: (m,) 1: a finger that closes is not above the table.
         counts_out: (reasons,) rows without a way are moved from those that are kept.
     """
@@ -183,7 +206,7 @@ def choose_approach(
     packed_out.resting[i] = pose
     packed_out.approach[i] = wp.vec3(wp.nan, wp.nan, wp.nan)
     for k in range(RETREATS):
-        if (clear[i] >> k) & 1 == 1 and under[i] == 0:
+        if (blocked[i] >> k) & 1 == 0 and under[i] == 0:
             packed_out.approach[i] = -retreat(palm, up, wp.transform_point(T, obj.com), k)
             return
     wp.atomic_sub(counts_out, Outcome.KEPT, 1)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from lgrasp.grasp.approach_kernels import RETREATS, Palm, check_table, choose_approach, close_above, try_retreats
+from lgrasp.grasp.approach_kernels import RETREATS, Palm, check_table, choose_approach, close_above, try_retreat
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check_kernels import (
     ALL,
@@ -160,12 +160,13 @@ class Check:
         centre, facing = palm_axis(self.hand.model)
         palm = make_struct(Palm, centre=wp.vec3(*map(float, centre)), facing=wp.vec3(*map(float, facing)))
         packed.resting, packed.approach = wp.empty(m, dtype=wp.int32, device=d), wp.empty(m, dtype=wp.vec3, device=d)
-        clear, under = (wp.zeros(m, dtype=wp.int32, device=d) for _ in range(2))
+        blocked, under = (wp.zeros(m, dtype=wp.int32, device=d) for _ in range(2))
         inputs = [self.hand.struct, self.obj.struct, self.limits, palm, self.at, row, packed]
-        wp.launch(try_retreats, (m, RETREATS), inputs, [clear], device=d)
+        for k in range(RETREATS):
+            wp.launch(try_retreat, (self.bodies, m), [*inputs, k], [blocked], device=d)
         inputs = [self.hand.struct, self.obj.struct, self.limits, self.at, row, packed]
         wp.launch(close_above, (self.hand.model.groups, m), inputs, [under], device=d)
-        inputs = [self.obj.struct, palm, self.at, row, clear, under]
+        inputs = [self.obj.struct, palm, self.at, row, blocked, under]
         wp.launch(choose_approach, m, inputs, [packed, tally.device], device=d)
 
     def _pack(self, seed: wp.array, row: wp.array) -> Packed:

@@ -2,8 +2,9 @@
 
 from collections import Counter
 from collections.abc import Collection
+from concurrent.futures import BrokenExecutor
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -99,7 +100,7 @@ class GenerateJob(GenerateRequest, SearchJob):
 
     def load(self, events: Events, missing: bool) -> None:
         if missing and self.writers() > 1:
-            self._writers = ProcessPool(self.writers())
+            self._writers = self.cache.kept.get("writers", self.writers(), partial(ProcessPool, self.writers()))
             self._writers.start(write_shard.__module__)
         super().load(events, missing)
 
@@ -133,12 +134,16 @@ class GenerateJob(GenerateRequest, SearchJob):
             super().write(part, contents)
             return
         with none_killed(f"writes {part.file}"):
-            self._writers.submit(write_shard, part.file, contents).result()
+            try:
+                self._writers.submit(write_shard, part.file, contents).result()
+            except BrokenExecutor:
+                self.cache.kept.forget("writers")
+                raise
 
     def close(self) -> None:
-        if self._writers:
-            self._writers.shutdown()
         self._writers = None
+        if not self.cache.more_jobs:
+            self.cache.kept.forget("writers")
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         result = make_shard(

@@ -159,10 +159,12 @@ def _make_share(
     resume: bool,
 ) -> None:
     """The work of a lane: its parts of all jobs, one after another."""
+    cache = Cache(root)
     for number, ((kind, values), array) in enumerate(zip(jobs, arrays, strict=True)):
         if link.stopped():
             return
-        cache = Cache(root, warn=lambda line, number=number: link.send((number, line)))
+        cache.warn = lambda line, number=number: link.send((number, line))
+        cache.more_jobs = number + 1 < len(jobs)
         try:
             array = array._replace(lane=lane, lanes=lanes)
             found = _run(kind, values | {"device": device}, cache, array, resume, _Telling(link, number))

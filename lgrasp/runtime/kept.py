@@ -21,10 +21,14 @@ class Keeper:
                 self._made[kind] = key, make()
             return self._made[kind][1]
 
-    def close(self) -> None:
-        """Forget everything; pools end."""
+    def forget(self, *kinds: str) -> None:
+        """Forget some kinds; pools end."""
         with self._lock:
-            for _, made in self._made.values():
+            for kind in kinds:
+                _, made = self._made.pop(kind, (None, None))
                 if isinstance(made, Executor):
                     made.shutdown(cancel_futures=True)
-            self._made.clear()
+
+    def close(self) -> None:
+        """Forget everything; pools end."""
+        self.forget(*self._made)
