@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     DeviceName = str | torch.device
 
 Name = str | Path
+_LEAST_PICTURE = 32  # pixels
 Hand = HandModel
 Object = ObjectModel
 
@@ -88,24 +89,31 @@ class Grasps(GraspRows):
         """
         return grasp_frame(self, self.hand.joint_names, self.objects)
 
-    def show(self, rows: int | Sequence[int] = 8, *, stage: str = "grasp", size: int = 256) -> "Image":
+    def show(self, rows: int | np.ndarray | Sequence[int] = 8, *, stage: str = "grasp", size: int = 256) -> "Image":
         """A picture of some grasps side by side, which a notebook shows.
 
         Args:
-            rows: numbers of rows, or how many, evenly spread.
+            rows: numbers of rows, a mask, or how many, evenly spread.
             stage: pregrasp, grasp or squeeze.
-            size: pixels of a side of each.
+            size: pixels of a side of each, at least 32.
 
         Raises:
-            LgraspError: there is no such row, or the hand cannot be drawn.
+            LgraspError: there is no such row or stage, or the hand cannot be drawn.
         """
         from lgrasp.dataset.scenes import SceneRows, draw_rows
+        from lgrasp.picture.scene import STAGES
 
-        if isinstance(rows, int) and rows < 1:
-            raise ConfigError(f"rows is {rows}; how many (1 or more), or a list of their numbers, is accepted")
+        if stage not in STAGES:
+            raise ConfigError(f"stage is '{stage}'; accepted: {', '.join(STAGES)}")
+        if size < _LEAST_PICTURE:
+            raise ConfigError(f"size is {size}; {_LEAST_PICTURE} or more pixels are accepted")
+        at = np.asarray(rows)
+        at = np.flatnonzero(at) if at.dtype == bool and at.shape == (len(self),) else at
+        if at.dtype.kind not in "iu" or not at.size or (not at.ndim and at < 1):
+            raise ConfigError(f"rows is {rows}; how many (1 or more), a list of their numbers or a mask is accepted")
         with _files(self) as files:
             found = SceneRows(files)
-            return draw_rows(found, found.spread(rows) if isinstance(rows, int) else list(rows), stage=stage, size=size)
+            return draw_rows(found, at.tolist() if at.ndim else found.spread(int(at)), stage=stage, size=size)
 
     def __repr__(self) -> str:
         names = ", ".join(record.name for record in self.objects)

@@ -72,7 +72,7 @@ def prune(
                 raise ConfigError(f"cache prune: no entries of kind '{name}'; there are: {', '.join(known)}")
     files, size = cache.prune(set(kind) if kind else None, before)
     if everything or "kernels" in (kind or ()):
-        size += cache.prune_kernels()
+        size += cache.prune_kernels(before)
     typer.echo(f"{files} files and {size / 1e6:.1f} MB removed from {cache.root}")
 
 

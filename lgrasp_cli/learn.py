@@ -104,6 +104,7 @@ def evaluate(
     starts: Annotated[int, Option("--starts", "-n", min=1, help="Plans per cloud (grasp).")] = 8,
     seed: Annotated[int, Option(min=0, help="Seed of the clouds.")] = 1,
     out: Annotated[Path | None, Option(help="Folder for the plans, as shards of the true meshes (grasp).")] = None,
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace plans in the folder.")] = False,
     device: Device = "auto",
     cache_dir: CacheDir = None,
     quiet: Quiet = False,
@@ -123,8 +124,9 @@ def evaluate(
     if (kind := read_card(path)["kind"]) == "grasp":
         from lgrasp.jobs.learn.grasp import evaluate as measure_plans
 
-        data = measure_plans(path, shards, cache, clouds=clouds, starts=starts, seed=seed, device=device, out=out)
-        return Answer(data, [] if quiet else [_plans(data)])
+        how: dict[str, Any] = {"clouds": clouds, "starts": starts, "seed": seed, "device": device}
+        data = measure_plans(path, shards, cache, **how, out=out, overwrite=overwrite)
+        return Answer(data, [] if quiet else [_plans(data), *_of_unknown(data["unknown"])])
     if out is not None:
         raise ConfigError(f"learn eval: --out is for networks of kind grasp; {path} is of kind {kind}")
     if kind == "diffuser":
@@ -172,6 +174,10 @@ def _draws(data: dict[str, Any]) -> Block:
         ("of the shards", told(data["of_data"])),
         ("time", f"{data['seconds_per_256']:.3f} s for 256 draws"),
     ]
+
+
+def _of_unknown(unknown: list[str]) -> list[str]:
+    return [f"not learnt from: {', '.join(unknown)}" if unknown else "the network learnt from all of these objects"]
 
 
 def _plans(data: dict[str, Any]) -> TextTable:

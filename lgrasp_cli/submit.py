@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from lgrasp.runtime.array import SUBMITTED
 from lgrasp.words import plural
 from lgrasp_cli.tables import Answer, reporting
 
@@ -45,14 +46,16 @@ def submit(
     """
     from lgrasp.errors import ConfigError
     from lgrasp.notices import notice
+    from lgrasp_cli.options import options_of
 
     words = words[1:] if words[0] == "lgrasp" else words
     checked = _checked(context.find_root().command, words)
     parts = sum(found for found, _ in checked)
     if parts < tasks:
+        smaller = "--shard-rows" in options_of(context.find_root().command, words)
+        more_files = ", or make smaller files (--shard-rows)" if smaller else ""
         raise ConfigError(
-            f"--tasks {tasks}: the command makes {plural(parts, 'file')}; give --tasks {parts} or fewer, or make "
-            "smaller files (--shard-rows)"
+            f"--tasks {tasks}: the command makes {plural(parts, 'file')}; give --tasks {parts} or fewer{more_files}"
         )
     if gpus > 1 and not any(re.match("--device(=|$)", word) for word in words):
         words = [*words, "--device", "all"]
@@ -143,6 +146,8 @@ def _script(options: dict[str, str], words: list[str]) -> str:
         for key in ("LGRASP_CACHE_DIR", "PYTHONPATH")
         if key in os.environ
     ]
+    if "array" in options:  # tasks that are submitted again know the whole
+        kept.append(f"export {SUBMITTED}={shlex.quote(options['array'])}")
     run = shlex.join([sys.executable, "-m", "lgrasp_cli", *words])
     return "\n".join(["#!/bin/bash", *lines, f"cd {shlex.quote(os.getcwd())} || exit 2", *kept, f"exec {run}"]) + "\n"
 

@@ -180,6 +180,13 @@ def known_hands(inputs: Inputs, cache_root: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("lgrasp.bench.comparison.Cache", known)
 
 
+@pytest.fixture(autouse=True)
+def unheard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Notices of each test begin anew, and go nowhere unless it listens."""
+    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(notices, "_listeners", [lambda line: None])
+
+
 @pytest.fixture
 def said(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Notices, as a process of its own tells them."""

@@ -71,8 +71,22 @@ def test_table(grasps, monkeypatch):
 def test_picture(grasps):
     assert grasps.show([0, 5, 7], size=40).width == 80
     assert grasps.show(1, size=40)._repr_png_().startswith(b"\x89PNG")  # what notebooks ask for
-    with pytest.raises(lg.LgraspError, match="row 12 does not exist"):
-        grasps.show([12])
+    mask = np.zeros(12, bool)
+    mask[[5, 7]] = True
+    pictures = [np.asarray(grasps.show(rows, size=40)) for rows in (mask, [5, 7], [0, 1])]
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    assert (pictures[0] != pictures[2]).any()
+    assert grasps.show(np.int64(2), size=40).width == 80
+    for wrong, message in (
+        ({"rows": [12]}, "row 12 does not exist"),
+        ({"rows": []}, r"rows is \[\]; how many"),
+        ({"rows": [0.5]}, r"rows is \[0\.5\]"),
+        ({"rows": mask[:5]}, "or a mask"),
+        ({"stage": "foo"}, "stage is 'foo'; accepted: pregrasp, grasp, squeeze"),
+        ({"size": -3}, "size is -3; 32"),
+    ):
+        with pytest.raises(lg.LgraspError, match=message):
+            grasps.show(**wrong)
 
 
 def test_refine_simulate_judge(grasps):

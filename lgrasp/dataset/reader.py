@@ -40,7 +40,10 @@ def open_hdf5(path: str | os.PathLike[str]) -> h5py.File:
     try:
         check_regular(path)
         with open(path, "rb"):
-            return h5py.File(path, "r", locking=False)
+            try:
+                return h5py.File(path, "r", locking=False)
+            except OSError:
+                return h5py.File(path, "r")  # as this process may have it open, with a lock
     except OSError as error:
         reason = error.strerror or " ".join(str(error).split())
         kind = "" if error.strerror else "not a whole HDF5 file: "
@@ -249,6 +252,16 @@ class ShardReader(FileReader):
         """First row and rows of each chunk of the file: all rows in bounded memory."""
         for start in range(0, len(self), CHUNK_ROWS):
             yield start, self.rows(start, start + CHUNK_ROWS)
+
+    def check_whole(self) -> None:
+        """Read all there is, so that every checksum is compared.
+
+        Raises:
+            ShardError: The file is damaged.
+        """
+        check_heaps(self.path)
+        for _ in self.blocks():
+            pass
 
     @property
     def header(self) -> ShardHeader:

@@ -4,7 +4,6 @@ import hashlib
 import io
 import json
 import os
-import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from lgrasp.errors import CacheError, OutputError
 from lgrasp.files import new_file, remove_leftovers
 from lgrasp.paths import cache_dir
 from lgrasp.runtime.kept import Keeper
-from lgrasp.runtime.kernel_cache import remove_unfinished
+from lgrasp.runtime.kernel_cache import remove_modules, remove_unfinished
 
 if TYPE_CHECKING:
     import numpy as np
@@ -170,11 +169,9 @@ class Cache:
         """Size of the compiled kernels, which Warp keeps in a folder of this one."""
         return sum(path.stat().st_size for path in (self.root / "kernels").rglob("*") if path.is_file())
 
-    def prune_kernels(self) -> int:
-        """Remove the compiled kernels; returns their size [bytes]."""
-        size = self.kernel_bytes()
-        shutil.rmtree(self.root / "kernels", ignore_errors=True)
-        return size
+    def prune_kernels(self, older_than: float | None = None) -> int:
+        """Remove the compiled kernels, of before a time [s since 1970]; returns their size [bytes]."""
+        return remove_modules(self.root / "kernels", older_than)
 
 
 def _unpack(data: bytes) -> "dict[str, np.ndarray]":

@@ -47,7 +47,7 @@ class Listing:
         self._describe, self._root, self._every, self._asks = describe, root, _by_folder(every), asks
         self._new = sorted({p for f in (root, *self.folders) for p in (f, *f.parents) if not p.exists()}, reverse=True)
         self._made: dict[Path, dict[str, ListedShard]] = defaultdict(dict)
-        self._dirty: set[Path] = set()
+        self._unlisted: dict[Path, dict[str, tuple[ListedShard, int]]] = defaultdict(dict)  # with the file's time [ns]
         self._lock = threading.Lock()
         self._mark = ExitStack()
         self._flushed = 0.0  # when, and how long it took [s]
@@ -112,11 +112,11 @@ class Listing:
         """List a part that was made; ``written``: its file is on disk, else there was nothing to write."""
         if part.file.suffix != SUFFIX:
             return
-        shard = self._entry(part)
+        shard, time_ns = self._entry(part), _time(part.file)
         shard = listed(shard, part.file, rows) if written else shard.model_copy(update={"rows": 0})
         with self._lock:
             self._made[part.file.parent][shard.file] = shard
-            self._dirty.add(part.file.parent)
+            self._unlisted[part.file.parent][shard.file] = shard, time_ns
         if time.monotonic() - self._flushed > self._took / _MOST_LISTING:
             self.flush()
 
@@ -128,13 +128,13 @@ class Listing:
                 file.unlink(missing_ok=True)
 
     def flush(self) -> None:
-        """Write what is not yet in the manifests."""
+        """Write what is not yet in the manifests; what is there another process may have made since."""
         with self._lock:
             begin = time.monotonic()
-            while self._dirty:
-                folder = self._dirty.pop()
-                shards = list(self._made[folder].values())
-                update_manifest(folder, partial(Manifest.record, run=self.run, shards=shards))
+            for folder, unlisted in self._unlisted.items():
+                if unlisted:
+                    update_manifest(folder, partial(_record, self.run, folder, list(unlisted.values())))
+                    unlisted.clear()
             self._flushed = time.monotonic()
             self._took = self._flushed - begin
 
@@ -156,6 +156,23 @@ class Listing:
     def _entry(self, part: Part) -> ListedShard:
         asked = part.rows if self._asks else None
         return ListedShard(file=part.file.name, shard_index=part.shard_index, asked=asked)
+
+
+def _record(run: ListedRun, folder: Path, shards: Sequence[tuple[ListedShard, int]], manifest: Manifest) -> None:
+    """Take up files of a run; one that was replaced since its SHA-256 was made (its time is another) as it is now."""
+    now = []
+    for shard, time_ns in shards:
+        changed = shard.sha256 and _time(folder / shard.file) not in (0, time_ns)
+        now.append(listed(shard, folder / shard.file, shard.rows or 0) if changed else shard)
+    manifest.record(run, now)
+
+
+def _time(path: Path) -> int:
+    """When a file was changed last [ns]; 0 if it is not there."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def begun_array(parts: Sequence[Part]) -> str:

@@ -58,7 +58,8 @@ class ShardJob(ShardRequest, Job):
         return parts
 
     def check_source(self, reader: ShardReader) -> None:
-        """Raise ShardError if a shard is none for this job; among others in a folder it is left out."""
+        """Raise ShardError if a shard is damaged, or none for this job; among others in a folder it is left out."""
+        reader.check_whole()
 
     def about(self) -> dict[str, Any]:
         return {"hand": ", ".join(sorted(self._hands)), "objects": sorted(self._objects)}
@@ -105,8 +106,8 @@ class ShardJob(ShardRequest, Job):
 
 
 def rows_digest(reader: ShardReader, more: Sequence[str] = ()) -> str:
-    """SHA-256 of the identity of the rows of a shard: joints, poses, objects, candidates; and of more columns."""
-    h = hashlib.sha256()
+    """SHA-256 of what the rows of a shard are: hand, objects, joints, poses, candidates; and of more columns."""
+    h = hashlib.sha256(repr((str(reader.attributes["hand_sha256"]), reader.object_keys)).encode())
     for name in (*_ROW, *more):
         for first in range(0, len(reader), _BATCH_ROWS):
             values: Any = reader.column(name, first, min(first + _BATCH_ROWS, len(reader)))

@@ -52,9 +52,10 @@ def pose_matrix(pose: np.ndarray) -> np.ndarray:
         pose: x y z [m] qw qx qy qz, shape [..., 7]; quaternions of any positive length. NaN gives NaN.
 
     Returns:
-        Shape [..., 4, 4], dtype of ``pose``.
+        Shape [..., 4, 4], dtype of ``pose``; float64 for integers.
     """
     pose = np.asarray(pose)
+    pose = pose if pose.dtype.kind == "f" else pose.astype(float)
     w, x, y, z = np.moveaxis(pose[..., 3:] / np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True), -1, 0)
     T = np.zeros((*pose.shape[:-1], 4, 4), dtype=pose.dtype)
     T[..., 0, 0], T[..., 0, 1], T[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)

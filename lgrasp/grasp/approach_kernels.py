@@ -20,6 +20,9 @@ APPROACH_LENGTH = 0.15
 RETREATS = wp.constant(7)
 """Directions in which the hand is tried to leave, by this order."""
 
+GPU_STRETCHES = 5
+"""Parts of the way that a GPU looks at side by side."""
+
 _STEPS = wp.constant(50)  # of the way, 3 mm each
 _SURE = wp.constant(1.0e-3)  # [m] of a distance in a grid
 _PARTS = wp.constant(8)  # of the way from q_pregrasp to q
@@ -92,16 +95,19 @@ def _body_pose(hand: Hand, b: wp.int32, q: wp.array2d(dtype=wp.float32), row: wp
 
 
 @wp.func
-def _way_blocked(hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.transform, way: wp.vec3):
-    """True if a body comes too deep into the object on the way from T = T_object_body by ``way`` (object's frame)."""
+def _way_blocked(
+    hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.transform, way: wp.vec3, first: wp.int32, end: wp.int32
+):
+    """True if a body comes too deep into the object in some steps of the way from T = T_object_body along
+    ``way`` (object's frame)."""
     ball = hand.pieces.body_sphere[b]
     if ball[3] < 0.0:
         return False
     centre = wp.transform_point(T, wp.vec3(ball[0], ball[1], ball[2]))
     length = APPROACH_LENGTH / float(_STEPS)
-    step = int(1)
-    while step <= _STEPS:
-        by = way * (length * float(step))
+    step = first
+    while step < end:
+        by = way * (length * float(step + 1))
         clear = sdf_value(obj.sdf, centre + by) - ball[3] - _SURE
         if clear > 0.0:
             step += wp.max(1, int(clear / length))  # it cannot touch before
@@ -114,7 +120,7 @@ def _way_blocked(hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.tra
 
 
 @wp.kernel
-def try_retreat(
+def try_retreats(
     hand: Hand,
     obj: Object,
     limits: Limits,
@@ -122,26 +128,31 @@ def try_retreat(
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
     packed: Packed,
-    k: wp.int32,
+    stretches: wp.int32,
     blocked_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per (body, row kept): can the open hand not leave by retreat k, as that is downwards or a body would
-    come into the object? Rows that can leave by one before are left out.
+    """One thread per (retreat, stretch, body, row kept): can the open hand not leave that way, since it is downwards or
+    the body would come into the object?
 
     Args:
         row: (m,) hand of each row, -1 none.
-        blocked_out: (m,) bit k: retreat k is; bits of those before are there.
+        stretches: of the way; 1: threads run in their order, and retreats after one that is clear are left out.
+        blocked_out: (m,) bit k: retreat k is; of zeros.
     """
-    b, i = wp.tid()
+    k, stretch, b, i = wp.tid()
     s = row[i]
-    if s < 0 or blocked_out[i] & ((1 << k) - 1) != (1 << k) - 1 or (blocked_out[i] >> k) & 1 == 1:
+    if s < 0 or (blocked_out[i] >> k) & 1 == 1:
+        return
+    if stretches == 1 and blocked_out[i] & ((1 << k) - 1) != (1 << k) - 1:
         return
     T = at.pose[at.of[s]]
     up = wp.transform_vector(T, obj.resting.up[at.resting[at.of[s]]])
     way = retreat(palm, up, wp.transform_point(T, obj.com), k)
     T_object = wp.transform_inverse(T)
     B = T_object * _body_pose(hand, b, packed.q_pregrasp, i)
-    if wp.dot(way, up) < 0.0 or _way_blocked(hand, obj, limits, b, B, wp.transform_vector(T_object, way)):
+    way_in = wp.transform_vector(T_object, way)
+    first, end = stretch * _STEPS // stretches, (stretch + 1) * _STEPS // stretches
+    if wp.dot(way, up) < 0.0 or _way_blocked(hand, obj, limits, b, B, way_in, first, end):
         wp.atomic_or(blocked_out, i, 1 << k)
 
 

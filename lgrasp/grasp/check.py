@@ -9,7 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from lgrasp.grasp.approach_kernels import RETREATS, Palm, check_table, choose_approach, close_above, try_retreat
+from lgrasp.grasp.approach_kernels import (
+    GPU_STRETCHES,
+    RETREATS,
+    Palm,
+    check_table,
+    choose_approach,
+    close_above,
+    try_retreats,
+)
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check_kernels import (
     ALL,
@@ -162,8 +170,8 @@ class Check:
         packed.resting, packed.approach = wp.empty(m, dtype=wp.int32, device=d), wp.empty(m, dtype=wp.vec3, device=d)
         blocked, under = (wp.zeros(m, dtype=wp.int32, device=d) for _ in range(2))
         inputs = [self.hand.struct, self.obj.struct, self.limits, palm, self.at, row, packed]
-        for k in range(RETREATS):
-            wp.launch(try_retreat, (self.bodies, m), [*inputs, k], [blocked], device=d)
+        stretches = 1 if d == "cpu" else GPU_STRETCHES
+        wp.launch(try_retreats, (RETREATS, stretches, self.bodies, m), [*inputs, stretches], [blocked], device=d)
         inputs = [self.hand.struct, self.obj.struct, self.limits, self.at, row, packed]
         wp.launch(close_above, (self.hand.model.groups, m), inputs, [under], device=d)
         inputs = [self.obj.struct, palm, self.at, row, blocked, under]

@@ -5,7 +5,6 @@ from abc import abstractmethod
 from pathlib import Path
 from typing import Any, ClassVar
 
-from lgrasp.dataset.files import check_heaps
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part
@@ -36,11 +35,6 @@ class VerdictJob(VerdictRequest, ShardJob):
 
     def key(self) -> str:
         return content_key(self.command, self.version, settings=self.settings())
-
-    def check_source(self, reader: ShardReader) -> None:
-        check_heaps(reader.path)
-        for _ in reader.blocks():  # whose checksums are compared
-            pass
 
     def found(self, part: Part) -> Found | None:
         if not self.in_place:  # else the source was checked

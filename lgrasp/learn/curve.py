@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from lgrasp.errors import ConfigError
 from lgrasp.picture.sheet import write_plot
 
 POINTS = 100
@@ -40,7 +41,13 @@ class LossCurve:
 
 
 def add_point(points: list[list[float]], step: int, value: float) -> None:
-    """Add (step, value) with six digits to a curve."""
+    """Add (step, value) with six digits to a curve.
+
+    Raises:
+        ConfigError: the value is not finite.
+    """
+    if not math.isfinite(value):
+        raise ConfigError(f"the training diverged: its loss is {value} at step {step:,}; lower the rates (--set)")
     points.append([step, float(f"{value:.6g}")])
 
 

@@ -9,6 +9,9 @@ from lgrasp.errors import ConfigError
 
 _SHOWN = 5  # numbers of parts
 
+SUBMITTED = "LGRASP_ARRAY"
+"""Variable of the environment with the array that a script was submitted as at first."""
+
 Part = TypeVar("Part")
 
 
@@ -63,6 +66,8 @@ class Array(NamedTuple):
     """Parts of all the jobs, if there are several."""
     begun: str = ""
     """The array of which these tasks are submitted again."""
+    submitted: str = ""
+    """The array that the script of this task was submitted as at first, as :attr:`SlurmArray.text`."""
     lane: int = 0
     """Number of the device, of :attr:`lanes` that share the parts of the task."""
     lanes: int = 1
@@ -71,7 +76,7 @@ class Array(NamedTuple):
         """With the numbers of the task and of the tasks.
 
         Args:
-            begun: the array that began the job's run, as :attr:`SlurmArray.text`; "" if none did.
+            begun: the array that began the job's run, as :attr:`SlurmArray.text`; "" if none did, or it is not known.
 
         Raises:
             ConfigError: numbers out of range, or a list of tasks that are not of an array that is known.
@@ -80,7 +85,7 @@ class Array(NamedTuple):
             if not 0 <= self.task < self.tasks:
                 raise ConfigError(f"--array {self.task}/{self.tasks}: need 0 <= task < number of tasks")
             return self
-        again = self.slurm.is_part_of(begun)
+        again = self.slurm.is_part_of(begun) or self.slurm.is_part_of(self.submitted)
         if not again and not self.slurm.whole:
             raise ConfigError(
                 f"array task {self.slurm.task}: {self.slurm.count} tasks from {self.slurm.first} to {self.slurm.last} "
@@ -89,7 +94,7 @@ class Array(NamedTuple):
             )
         found = again or self.slurm
         task = (found.task - found.first) // found.step
-        return self._replace(task=task, tasks=found.count, begun=begun if again else "")
+        return self._replace(task=task, tasks=found.count, begun=again.text if again else "")
 
     def share(self, parts: Sequence[Part], what: str = "part") -> list[Part]:
         """Those of a job's parts that the task makes, in its lane.
@@ -161,7 +166,9 @@ def _slurm(environment: Mapping[str, str]) -> Array:
         return Array()
     names = [f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "MIN", "MAX", "STEP", "COUNT")]
     try:
-        return Array(slurm=SlurmArray(*(int(environment[name]) for name in names)))
+        return Array(
+            slurm=SlurmArray(*(int(environment[name]) for name in names)), submitted=environment.get(SUBMITTED, "")
+        )
     except KeyError as error:
         raise ConfigError(f"{error.args[0]} is not set; give --array I/N or --array off") from None
     except ValueError as error:

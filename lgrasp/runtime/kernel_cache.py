@@ -109,6 +109,26 @@ def remove_unfinished(folder: Path) -> None:
                 shutil.rmtree(path)
 
 
+def remove_modules(folder: Path, before: float | None = None) -> int:
+    """Remove compiled modules of a folder and of those below it, not what is being compiled.
+
+    Args:
+        before: only those compiled before a time [s since 1970].
+
+    Returns:
+        Their size [bytes].
+    """
+    size = 0
+    for inner in (folder, *(path for path in folder.rglob("*") if path.is_dir() and _modules(path))):
+        for module in _modules(inner):
+            with suppress(OSError):
+                files = [path.stat() for path in module.iterdir() if path.is_file()]
+                if files and (before is None or max(info.st_mtime for info in files) < before):
+                    size += sum(info.st_size for info in files)
+                    _drop(module)
+    return size
+
+
 def _modules(folder: Path) -> list[Path]:
     try:
         return [Path(entry) for entry in os.scandir(folder) if entry.is_dir() and not _UNFINISHED.search(entry.name)]

@@ -59,6 +59,12 @@ def add_mesh(
     )
 
 
+def painted(mesh: trimesh.Trimesh, colour: str) -> trimesh.Trimesh:
+    """The mesh itself, in a colour."""
+    mesh.visual.face_colors = [*rgb(colour), 255]  # ty: ignore[invalid-assignment]
+    return mesh
+
+
 class HandFigure:
     """The links of a hand, each a frame with its mesh, below a node."""
 
@@ -152,9 +158,7 @@ class GraspFigure:
         """What is shown, without marks, in the frame of the node."""
         assert self.shown is not None
         q, held = self.shown.at(self._time)
-        objects = {f"object{i}": placed.placed for i, placed in enumerate(self.shown.objects[:held])}
-        found = {**self.shown.hand.placed(q), **objects}
-        for name, mesh in found.items():
-            colour = OBJECTS[0] if name in objects else HAND[0]
-            mesh.visual.face_colors = [*rgb(colour), 255]  # ty: ignore[invalid-assignment]
+        found = {name: painted(mesh, HAND[0]) for name, mesh in self.shown.hand.placed(q).items()}
+        for i, placed in enumerate(self.shown.objects[:held]):
+            found[f"object{i}"] = painted(placed.placed, OBJECTS[i % len(OBJECTS)])
         return found

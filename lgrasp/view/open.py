@@ -11,6 +11,7 @@ import numpy as np
 from lgrasp.dataset.reader import open_hdf5
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.engine.cache import Cache
+from lgrasp.errors import ConfigError
 from lgrasp.scenes.schema import FORMAT
 from lgrasp.view.names import kind_of
 from lgrasp.view.server import Site, View, close_site, open_site
@@ -36,8 +37,8 @@ def open_view(
 
     Args:
         what: shards or folders of them; or one scene file (of a folder the first), hand or object, by name or path.
-        row: the first that is shown, counted through all shards.
-        where: conditions on rows.
+        row: the first that is shown, counted through all shards; of a scene, its own.
+        where: conditions on rows of shards.
         served: called once browsers have an answer; what they are to show is made then.
 
     Raises:
@@ -90,6 +91,13 @@ def _object(name: str, cache: Cache) -> "_Make":
     return partial(ObjectView, name=found.name, mesh=mesh, notes=tuple(found.notes))
 
 
+def _refuse(what: str, **options: object) -> None:
+    """Raise ConfigError for an option that has no meaning for what is shown."""
+    for option, value in options.items():
+        if value:
+            raise ConfigError(f"--{option} is for grasps; {what} has {'no rows' if option == 'row' else 'no metrics'}")
+
+
 def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) -> "_Make":
     """What makes the view, all input read."""
     name, path, kind = what[0], Path(what[0]).expanduser(), kind_of(what)
@@ -101,11 +109,14 @@ def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) ->
             from lgrasp.scenes.files import read_scene  # slow to load
             from lgrasp.view.table import TableView
 
-            return partial(TableView, scene=read_scene(inside[0]))
-    if kind == "hand":
-        return _hand(name, cache)
-    if kind == "object":
-        return _object(name, cache)
+            _refuse(f"scene {inside[0]}", where=where)
+            scene = read_scene(inside[0])
+            if row and row >= len(scene.grasps.target):
+                raise ConfigError(f"row {row} does not exist; scene {inside[0]} has {len(scene.grasps.target):,}")
+            return partial(TableView, scene=scene, row=row)
+    if kind in {"hand", "object"}:
+        _refuse(f"{kind} {name}", row=row, where=where)
+        return (_hand if kind == "hand" else _object)(name, cache)
     rows, conditions = SceneRows([Path(one).expanduser() for one in what]), ", ".join(where)
     (readable,) = rows.sound(range(row, max(len(rows), row + 1)), most=1, look=rows.read)
     rows.meeting(conditions)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import viser
 
 _ROOM = 1.25  # times as far away as it must be
+_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # glTF has y up
 _PATIENCE = 20.0  # [s] for a browser to draw a picture
 
 
@@ -62,5 +63,7 @@ def add_saving(server: "viser.ViserServer", view: View, name: str) -> None:
     @model.on_click
     def _(event: "viser.GuiEvent") -> None:
         if event.client is not None:
-            data = export_glb(view.meshes())
+            scene = view.meshes()
+            scene.apply_transform(_Z_UP)
+            data = export_glb(scene)
             event.client.send_file_download(f"{name}.glb", data, save_immediately=True)

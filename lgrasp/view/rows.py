@@ -9,6 +9,7 @@ import trimesh
 
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.errors import LgraspError
+from lgrasp.notices import notice
 from lgrasp.view.figure import STAGE_MARKS, GraspFigure, Marks
 from lgrasp.view.front import row_link
 from lgrasp.view.page import Aim, add_saving
@@ -76,7 +77,10 @@ class RowsView(View):
         self._step.on_click(self._guarded(lambda: self._go(1 if self._step.value == "next" else -1)))
         if where:
             self._choose()
-            self._at.value = int(np.argmin(np.abs(np.asarray(self.order) - row)))
+            nearest = int(np.argmin(np.abs(np.asarray(self.order) - row)))
+            if row and self.order[nearest] != row:
+                notice(f"row {row:,} does not satisfy the conditions; row {self.order[nearest]:,} is shown")
+            self._at.value = nearest
         self._show()
 
     def tick(self, seconds: float) -> None:

@@ -11,7 +11,7 @@ from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.draw import OBJECTS, rgb
 from lgrasp.picture.scene import STAGES, ContactMarks, GraspScene, HandShape, PlacedObject, Step
 from lgrasp.scenes.records import SceneRecord
-from lgrasp.view.figure import STAGE_MARKS, GraspFigure, add_mesh, place, show_all
+from lgrasp.view.figure import STAGE_MARKS, GraspFigure, add_mesh, painted, place, show_all
 from lgrasp.view.front import row_link
 from lgrasp.view.page import Aim, add_saving
 from lgrasp.view.server import View
@@ -26,9 +26,9 @@ _AWAY = 2.0  # times as far as the objects need, to see hand and table
 
 
 class TableView(View):
-    """A scene: objects, table, cloud and its grasps one at a time."""
+    """A scene: objects, table, cloud and its grasps one at a time; first the free ones, unless a row is asked for."""
 
-    def __init__(self, server: "viser.ViserServer", scene: SceneRecord) -> None:
+    def __init__(self, server: "viser.ViserServer", scene: SceneRecord, row: int = 0) -> None:
         self._server, self._scene = server, scene
         records = [scene.objects[i] for i in scene.object_index]
         poses = pose_matrix(np.asarray(scene.object_pose, float))
@@ -37,8 +37,8 @@ class TableView(View):
         for i, placed in enumerate(self._objects):
             nodes.append(add_mesh(server.scene, f"/object{i}", placed.mesh, OBJECTS[i % len(OBJECTS)]))
             place(nodes[-1], placed.pose)
-        table = trimesh.creation.box((scene.table, scene.table, _THICK)).apply_translation([0, 0, -_THICK / 2])
-        nodes.append(add_mesh(server.scene, "/table", table, _TABLE))
+        self._table = trimesh.creation.box((scene.table, scene.table, _THICK)).apply_translation([0, 0, -_THICK / 2])
+        nodes.append(add_mesh(server.scene, "/table", self._table, _TABLE))
         colours = np.array([rgb(_TABLE), *(rgb(colour) for colour in OBJECTS)], np.uint8)
         which = np.where(scene.cloud.labels == 0, 0, 1 + (scene.cloud.labels - 1) % len(OBJECTS))
         dark = (0.7 * colours[which]).astype(np.uint8)
@@ -70,6 +70,8 @@ class TableView(View):
             self._at.on_update(lambda _: self._show())
             self._time.on_update(lambda _: self._show())
             self._show()
+            if row:
+                self.go(row)
         add_saving(server, self, f"scene-{scene.index}")
         Aim([], [placed.placed for placed in self._objects], np.zeros((0, 3))).apply(server, np.zeros(3), _AWAY)
 
@@ -79,8 +81,10 @@ class TableView(View):
         self._at.value = int(np.flatnonzero(self._rows == row)[0])
 
     def meshes(self) -> trimesh.Scene:
-        """Objects, and the hand."""
-        scene = trimesh.Scene({f"object{i}": placed.placed for i, placed in enumerate(self._objects)})
+        """Objects, table, and the hand."""
+        scene = trimesh.Scene({"table": painted(self._table, _TABLE)})
+        for i, placed in enumerate(self._objects):
+            scene.add_geometry(painted(placed.placed, OBJECTS[i % len(OBJECTS)]), f"object{i}", f"object{i}")
         if self._figure is not None:
             T = pose_matrix(np.concatenate([self._figure.frame.position, self._figure.frame.wxyz]))
             for name, mesh in self._figure.meshes().items():

@@ -9,10 +9,10 @@ from lgrasp.errors import ConfigError
 from lgrasp.runtime.array import Array, SlurmArray, parse_array
 
 
-def slurm(task: int, first: int, last: int, count: int, step: int = 1) -> Array:
+def slurm(task: int, first: int, last: int, count: int, step: int = 1, **more: str) -> Array:
     """Task of an array as slurmctld 22.05 describes it: of a list the step is 1."""
     names = {"ID": task, "MIN": first, "MAX": last, "COUNT": count, "STEP": step}
-    return parse_array("auto", {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in names.items()})
+    return parse_array("auto", {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in names.items()} | more)
 
 
 class Words(Events):
@@ -51,6 +51,16 @@ def test_what_the_option_accepts():
 )
 def test_ranges(array, numbers):
     assert array.resolved()[:2] == numbers
+
+
+def test_a_submitted_script_knows_the_whole_array():
+    """Of tasks that are submitted again, also where no manifest tells, as of shards that get more columns."""
+    for task in (1, 3):
+        assert slurm(task, 1, 3, 2, LGRASP_ARRAY="0-3").resolved()[:2] == (task, 4)
+    assert slurm(2, 2, 3, 2, LGRASP_ARRAY="0-3").resolved()[:2] == (2, 4)
+    assert slurm(1, 0, 3, 4, LGRASP_ARRAY="0-3").resolved()[:2] == (1, 4)
+    with pytest.raises(ConfigError, match="this folder knows nothing"):
+        slurm(1, 1, 3, 2, LGRASP_ARRAY="nonsense").resolved()
 
 
 def test_lanes_share_what_a_task_has():

@@ -14,6 +14,7 @@ from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.selection import ExportObject, Selection
 from lgrasp.errors import OutputError
 from lgrasp.files import remove_leftovers, write_file
+from lgrasp.notices import notice
 from lgrasp.words import listed
 
 
@@ -88,6 +89,8 @@ def write_assets(out: Path, selection: Selection) -> None:
     for name, data in hand_files(selection.hand, selection.shards[0]).items():
         write_file(out / HAND / name, data)
     for item in selection.objects:
+        if not len(item.mesh().faces):
+            notice(f"object '{item.code}' is a point cloud: {out / OBJECTS / item.code}.obj has points and no faces")
         write_file(out / OBJECTS / f"{item.code}.obj", object_text(item))
 
 

@@ -202,6 +202,7 @@ def select_rows(
 
     def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         """The rows that conditions leave, their ``object_index`` and parts, and the number of all rows."""
+        reader.check_whole()
         rows, index = chosen_rows(reader, where, single=single)
         parts = np.zeros(len(reader), int) if split is None else split.numbers(reader)
         return rows, index, parts[rows], len(reader)

@@ -21,10 +21,11 @@ from lgrasp.runtime.optional import import_optional
 
 _POSTURES = ("grasp", "pregrasp", "squeeze")
 _HAND = "/World/hand"
+_POINT = 0.002  # [m] of a point cloud
 
 USD_NOTES = """\
-grasps/CODE.usdc   USD stage of all grasps of one object: metres, z up. Time code t is the t-th grasp, and holds
-                   until the next.
+grasps/CODE.usdc   USD stage of all grasps of one object: metres, z up. Time code t is the t-th grasp; between
+                   two codes is neither.
 
   /World/CODE      the object's mesh, at the origin, not turned
   /World/hand/*    the links that have a surface: their transform in the object's frame is a time sample, the mesh is
@@ -69,13 +70,17 @@ class UsdWriter:
     def _stage(self, place: int, item: ExportObject, advance: Callable[[int], None]) -> Any:
         usd, geom, types = self._pxr.Usd, self._pxr.UsdGeom, self._pxr.Sdf.ValueTypeNames
         stage = usd.Stage.CreateInMemory()
-        stage.SetInterpolationType(usd.InterpolationTypeHeld)
         geom.SetStageMetersPerUnit(stage, 1.0)
         geom.SetStageUpAxis(stage, geom.Tokens.z)
         stage.SetDefaultPrim(geom.Xform.Define(stage, "/World").GetPrim())
         record = item.mesh()
         name = free_name(self._pxr.Tf.MakeValidIdentifier(item.code), "", ["hand"])
-        self._mesh(stage, f"/World/{name}", Trimesh(record.vertices, record.faces, process=False))
+        if len(record.faces):
+            self._mesh(stage, f"/World/{name}", Trimesh(record.vertices, record.faces, process=False))
+        else:
+            points = geom.Points.Define(stage, f"/World/{name}")
+            points.CreatePointsAttr(np.asarray(record.vertices, np.float32))
+            points.CreateWidthsAttr(np.full(len(record.vertices), _POINT, np.float32))
         hand = geom.Xform.Define(stage, _HAND).GetPrim()
         variants = hand.GetVariantSets().AddVariantSet("posture")
         for posture in _POSTURES:

@@ -35,7 +35,7 @@ grasps/PART-NUMBER.tar   WebDataset: a file KEY.json for each grasp; PART is tra
   q, q_pregrasp, q_squeeze
                    joints at the grasp [rad or m], before closing, and as targets that press, in the order below
   holds            false where a simulator saw the grasp fail, or the row fails a bound
-  candidate        tells rows apart: with the run, it regenerates the row
+  candidate        number of the pose that the row was found from; rows of one pose share it
   metrics, physics numbers and verdicts that all shards have, null where not finite
 {table}
 {root} is the root link of hand/hand.urdf.

@@ -15,6 +15,7 @@ from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
+from lgrasp.errors import OutputError
 from lgrasp.geometry.poses import internal_poses, user_poses
 from lgrasp.geometry.rotations import motion_from_pose
 from lgrasp.grasp.check import check_grasps
@@ -34,8 +35,9 @@ from lgrasp.jobs.requests.shards import GraspRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard, palmar_side
 from lgrasp.learn.curve import LossCurve
-from lgrasp.learn.diffuser.examples import SequenceSteps, make_net, unseen_objects
+from lgrasp.learn.diffuser.examples import SequenceSteps, make_net, split_steps, unseen_objects
 from lgrasp.learn.diffuser.features import mesh_centre
+from lgrasp.learn.diffuser.file import stored_state
 from lgrasp.learn.diffuser.senses import coarse_grid
 from lgrasp.learn.diffuser.training import StepTrainer
 from lgrasp.learn.examples import seen_cloud
@@ -45,7 +47,7 @@ from lgrasp.learn.grasp.examples import first_steps, grasp_examples
 from lgrasp.learn.grasp.file import KIND, VERSION, Networks, load_networks, predictor_bytes
 from lgrasp.learn.grasp.solids import random_solids
 from lgrasp.learn.grasp.views import SIDES, camera, draw_views
-from lgrasp.learn.networks import SHARDS, check_network_hand
+from lgrasp.learn.networks import SHARDS, check_network_hand, check_trained
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams, cloud_params
@@ -67,6 +69,8 @@ class GraspJob(GraspRequest, NetworkJob):
         p, alias, start = self.params, self.device_used.alias, time.perf_counter()
         hand, records, steps, views = self._examples()
         unseen = unseen_objects([record.sha256 for record in records], p.held_out, p.seed)
+        learnt = len(split_steps(steps.object, steps.held, unseen)[0])
+        self.enough(learnt, "grasps", _LEAST, len(steps.t) - learnt)
         seconds = {"reading": time.perf_counter() - start}
         state = torch.random.get_rng_state()
         torch.manual_seed(p.seed)
@@ -88,13 +92,14 @@ class GraspJob(GraspRequest, NetworkJob):
         names, curves = [r.name for r in records], {"completion": {"loss": completion.points}, "drawing": curve}
         report = training_report(hand.name, trainer, names, unseen, seconds, curves) | {"completion_loss": error}
         made = Networks(trainer.kept, completes, p, hand.name, hand.sha256, self.key(), report)
+        check_trained(stored_state(trainer.kept), stored_state(completes))
         return Made(part.rows, predictor_bytes(made))
 
     def _examples(self) -> tuple[HandModel, list[ObjectRecord], SequenceSteps, ViewSet]:
         """The hand, objects, grasps and views.
 
         Raises:
-            ConfigError: too few grasps.
+            ConfigError: there are no grasps.
         """
         p, device = self.params, self.device_used
         parts = read_parts(self.shards)
@@ -112,7 +117,8 @@ class GraspJob(GraspRequest, NetworkJob):
             centred = np.asarray(record.vertices, float) - centre
             views += draw_views(centred, record.faces, p.views, p.cloud, rng, device.alias)
             records.append(record)
-        self.enough(sum(len(q) for _, q, _ in rows), "grasps", _LEAST)
+        if not rows:
+            self.enough(0, "grasps", _LEAST)
         pose, q, number = (torch.as_tensor(np.concatenate(x)) for x in zip(*rows, strict=True))
         return (
             hand,
@@ -132,24 +138,36 @@ def evaluate(
     seed: int = 1,
     device: str = "auto",
     out: Path | None = None,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Plans from new clouds of the objects of shards, checked on the meshes; of each kind of cloud.
 
     Args:
         clouds: of each object and kind. starts: of each cloud.
         out: folder for the plans as rows of the meshes, for the simulator, by kind.
+        overwrite: replace plans that are there.
+
+    Returns:
+        ``hand``, ``unknown`` (objects that it was not trained on), ``kinds``, ``seconds``.
 
     Raises:
         ConfigError: the file is no predictor, or of another hand than the shards.
+        OutputError: there are plans in the folder.
         LgraspError: shards cannot be used.
     """
+    folders = {} if out is None else {kind: out / kind.replace(" ", "-") for kind in KINDS}
+    there = [file for folder in folders.values() for file in sorted(folder.glob("*.h5"))]
+    if there and not overwrite:
+        raise OutputError(f"{there[0]} is of an evaluation before; choose another --out, or --overwrite to replace it")
     found = resolve_device(device)
     networks, parts = load_networks(path), read_parts(shards)
     first = next(iter(parts.values()))
     source, hand = hand_of_shard(cache, first.hand, first.config, found)
     check_network_hand(path, networks.hand, networks.hand_sha256, hand.name, hand.sha256, words=SHARDS)
     touching, palmar = palmar_side(cache, source, hand, found)
-    bench = _Bench(networks, source, upload_hand(touching, found.alias), palmar, starts, cloud_params(PlanParams()))
+    told = {"network": path.name, "run_key": networks.run_key, "clouds": clouds, "starts": starts}
+    hand_on_device, params = upload_hand(touching, found.alias), cloud_params(PlanParams())
+    bench = _Bench(networks, source, hand_on_device, palmar, starts, params, seed, told)
     begin = time.perf_counter()
     kinds: dict[str, Any] = {kind: {} for kind in KINDS}
     for number, (_, part) in enumerate(sorted(parts.items())):
@@ -159,8 +177,11 @@ def evaluate(
             table = join_rows([bench.plans(model, kind, rng, c) for c in range(clouds)])
             kinds[kind][model.name] = _numbers(table, clouds * starts)
             if out is not None:
-                bench.write(out / kind.replace(" ", "-"), model, table)
-    return {"hand": hand.name, "kinds": kinds, "seconds": time.perf_counter() - begin}
+                while there:
+                    there.pop().unlink(missing_ok=True)
+                bench.write(folders[kind], model, table)
+    unknown = sorted({part.record.id for part in parts.values()} - set(networks.report.get("objects", ())))
+    return {"hand": hand.name, "unknown": unknown, "kinds": kinds, "seconds": time.perf_counter() - begin}
 
 
 @dataclass(frozen=True)
@@ -173,6 +194,9 @@ class _Bench:
     palmar: ContactSurface
     starts: int
     params: PlanParams
+    seed: int
+    told: dict[str, Any]
+    """What shards say of the evaluation."""
 
     def plans(self, model: ObjectModel, kind: str, rng: np.random.Generator, number: int) -> GraspTable:
         """Plans from a new cloud of a mesh as rows of it: checked there, with the control poses that were planned."""
@@ -191,8 +215,8 @@ class _Bench:
     def write(self, folder: Path, model: ObjectModel, table: GraspTable) -> None:
         """Rows of one mesh as a shard."""
         hand = self.hand.model
-        config = {"bounds": self.params.bounds.describe(), **hand_config(self.source)}
-        header = ShardHeader(pipeline="plan", seed=0, shard_index=0, config=config)
+        config = {"bounds": self.params.bounds.describe(), **hand_config(self.source), "learn_eval": self.told}
+        header = ShardHeader(pipeline="plan", seed=self.seed, shard_index=0, config=config)
         record = hand_record(hand, mesh_blobs(self.source.urdf))
         rows = grasp_rows(press(table), hand.tree, model.center)
         shard = Shard(header=header, hand=record, objects=[object_record(model)], grasps=rows, statistics={})

@@ -26,7 +26,7 @@ from lgrasp.jobs.shard_inputs import object_of_shard
 from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.examples import Examples, make_examples
 from lgrasp.learn.network import Coarse, CoarseNet
-from lgrasp.learn.networks import SHARDS, check_network_hand, network_bytes, open_network
+from lgrasp.learn.networks import SHARDS, check_network_hand, check_trained, network_bytes, open_network
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import ANSWERS, Measured, Trainer, measure
 from lgrasp.object.arrays import upload_object
@@ -87,6 +87,7 @@ class FitJob(NetworkJob):
         card: dict[str, Any] = dict(zip(("kind", "version"), self.kind, strict=True))
         card |= {"hand": hand.name, "hand_sha256": hand.sha256, "params": report["params"], "run_key": self.key()}
         weights = {name: values.cpu() for name, values in trainer.net.state_dict().items()}
+        check_trained(weights)
         return Made(part.rows, network_bytes(card | {"report": report}, weights))
 
 

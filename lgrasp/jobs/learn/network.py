@@ -61,11 +61,12 @@ class NetworkJob(FitRequest, FileJob):
     def parts(self) -> list[Part]:
         return [Part(0, self.out, sum(getattr(self.params, name) for name in self.steps))]
 
-    def enough(self, count: int, what: str, least: int) -> None:
-        """Raises ConfigError if there are too few grasps, or what else is learnt from."""
+    def enough(self, count: int, what: str, least: int, held_out: int = 0) -> None:
+        """Raises ConfigError if there are too few grasps, or what else is learnt from, besides those held out."""
         if count < least:
             shards = ", ".join(map(str, self.shards))
-            raise ConfigError(f"{shards}: {count} {what}; at least {least} are needed to learn from")
+            others = f" besides the {held_out} that have to do with what is held out (held_out)" if held_out else ""
+            raise ConfigError(f"{shards}: {count} {what}{others}; at least {least} are needed to learn from")
 
     def found(self, part: Part) -> Found:
         with open_network(part.file, *self.kind) as (card, _):
@@ -95,7 +96,8 @@ def training_report(
         "hand": hand,
         "objects": sorted({name for name, held in kinds if not held}),
         "unseen": sorted({name for name, held in kinds if held}),
-        "examples": len(trainer.examples),
+        "examples": len(trainer.rows),
+        "unseen_examples": len(trainer.unseen_rows),
         "loss": loss,
         "unseen_loss": None if np.isnan(held_out) else held_out,
         "seconds": seconds,

@@ -65,6 +65,7 @@ class RefineJob(RefineRequest, ShardJob):
         return parts
 
     def check_source(self, reader: ShardReader) -> None:
+        super().check_source(reader)
         if reader.space_names is not None or len(reader.object_ids) != 1 or reader.columns["object_index"][0][1] != 1:
             raise ShardError(
                 f"{reader.path}: rows of several objects cannot be refined; one object to a shard is accepted"

@@ -71,7 +71,7 @@ def read_parts(paths: Paths) -> dict[tuple[str, str], Grasped]:
 def _single(reader: ShardReader) -> tuple[ObjectRecord, dict[str, np.ndarray]]:
     """The object of a shard, and its columns."""
     if reader.space_names is not None or len(reader.object_ids) != 1:
-        raise ShardError(f"{reader.path}: holds several objects; grasps of single objects are brought into scenes")
+        raise ShardError(f"{reader.path}: holds several objects to a row; grasps of single objects are accepted")
     (record,) = mesh_objects(reader)
     columns = {name: reader.column(name) for name in _COLUMNS}
     columns["T_hand_object"] = reader.column("object_pose")[:, 0]
