@@ -20,10 +20,11 @@ APPROACH_LENGTH = 0.15
 RETREATS = wp.constant(7)
 """Directions in which the hand is tried to leave, by this order."""
 
-GPU_STRETCHES = 5
-"""Parts of the way that a GPU looks at side by side."""
+STRETCHES = wp.constant(5)
+"""Parts of the way that are looked at side by side."""
 
-_STEPS = wp.constant(50)  # of the way, 3 mm each
+_COARSE_STEPS = wp.constant(15)  # of all ways
+_STEPS = wp.constant(50)  # of the one that is taken, 3 mm each
 _SURE = wp.constant(1.0e-3)  # [m] of a distance in a grid
 _PARTS = wp.constant(8)  # of the way from q_pregrasp to q
 _LEAST_SINE = wp.constant(1.0e-3)
@@ -84,6 +85,21 @@ def check_table(hand: Hand, obj: Object, limits: Limits, part: wp.int32, at: Che
 
 
 @wp.func
+def _up(obj: Object, at: CheckedPostures, s: wp.int32):
+    """Unit normal of the table below hand s, base frame."""
+    return wp.transform_vector(at.pose[at.of[s]], obj.resting.up[at.resting[at.of[s]]])
+
+
+@wp.func
+def first_clear(clear: wp.array(dtype=wp.int32), i: wp.int32):
+    """The first retreat of row i that is clear, -1 none."""
+    for k in range(RETREATS):
+        if (clear[i] >> k) & 1 == 1:
+            return k
+    return -1
+
+
+@wp.func
 def _body_pose(hand: Hand, b: wp.int32, q: wp.array2d(dtype=wp.float32), row: wp.int32):
     """T_base_body of body b with row ``row`` of q (N, K)."""
     if b == 0:
@@ -95,18 +111,16 @@ def _body_pose(hand: Hand, b: wp.int32, q: wp.array2d(dtype=wp.float32), row: wp
 
 
 @wp.func
-def _way_blocked(
-    hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.transform, way: wp.vec3, first: wp.int32, end: wp.int32
-):
-    """True if a body comes too deep into the object in some steps of the way from T = T_object_body along
-    ``way`` (object's frame)."""
+def _way_blocked(hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.transform, way: wp.vec3, first: wp.int32):
+    """True if a body comes too deep into the object on a stretch, from step ``first`` on, of the way from
+    T = T_object_body along ``way`` (object's frame)."""
     ball = hand.pieces.body_sphere[b]
     if ball[3] < 0.0:
         return False
     centre = wp.transform_point(T, wp.vec3(ball[0], ball[1], ball[2]))
     length = APPROACH_LENGTH / float(_STEPS)
-    step = first
-    while step < end:
+    step = int(first)
+    while step < first + _STEPS // STRETCHES:
         by = way * (length * float(step + 1))
         clear = sdf_value(obj.sdf, centre + by) - ball[3] - _SURE
         if clear > 0.0:
@@ -128,32 +142,72 @@ def try_retreats(
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
     packed: Packed,
-    stretches: wp.int32,
-    blocked_out: wp.array(dtype=wp.int32),
+    clear_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per (retreat, stretch, body, row kept): can the open hand not leave that way, since it is downwards or
-    the body would come into the object?
+    """One thread per (row kept, retreat): does the open hand leave that way, not downwards, and clear of the object?
+
+    Retreats after one that is clear may be left out.
 
     Args:
         row: (m,) hand of each row, -1 none.
-        stretches: of the way; 1: threads run in their order, and retreats after one that is clear are left out.
-        blocked_out: (m,) bit k: retreat k is; of zeros.
+        clear_out: (m,) bit k: retreat k is; of zeros.
     """
-    k, stretch, b, i = wp.tid()
+    i, k = wp.tid()
     s = row[i]
-    if s < 0 or (blocked_out[i] >> k) & 1 == 1:
-        return
-    if stretches == 1 and blocked_out[i] & ((1 << k) - 1) != (1 << k) - 1:
+    if s < 0 or clear_out[i] & ((1 << k) - 1) != 0:
         return
     T = at.pose[at.of[s]]
-    up = wp.transform_vector(T, obj.resting.up[at.resting[at.of[s]]])
+    up = _up(obj, at, s)
     way = retreat(palm, up, wp.transform_point(T, obj.com), k)
+    if wp.dot(way, up) < 0.0:
+        return
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    for g in range(hand.kin.groups):
+        group_forward(hand.kin, g, group_dofs(hand.kin, g, packed.q_pregrasp, i), X, hand.kin.joint_first[g])
+    T_object = wp.transform_inverse(T)
+    bodies = hand.body_group.shape[0]
+    for step in range(_COARSE_STEPS):
+        moved = wp.transform(way * (APPROACH_LENGTH * float(step + 1) / float(_COARSE_STEPS)), wp.quat_identity())
+        for b in range(bodies):
+            B = moved
+            if b > 0:
+                B = moved * X[b - 1]
+            if body_depth(hand, obj, b, T_object * B, limits.max_penetration) > limits.max_penetration:
+                return
+    wp.atomic_or(clear_out, i, 1 << k)
+
+
+@wp.kernel
+def check_way(
+    hand: Hand,
+    obj: Object,
+    limits: Limits,
+    palm: Palm,
+    at: CheckedPostures,
+    row: wp.array(dtype=wp.int32),
+    packed: Packed,
+    clear: wp.array(dtype=wp.int32),
+    refused_out: wp.array(dtype=wp.int32),
+):
+    """One thread per (stretch, body, row kept): is the first retreat that is clear so at every step of a stretch?
+
+    Args:
+        row: (m,) hand of each row, -1 none.
+        clear: (m,) bit k: retreat k is clear.
+        refused_out: (m,) 1: it is not; of zeros.
+    """
+    stretch, b, i = wp.tid()
+    s = row[i]
+    k = first_clear(clear, i)
+    if s < 0 or k < 0 or refused_out[i] == 1:
+        return
+    T = at.pose[at.of[s]]
+    way = retreat(palm, _up(obj, at, s), wp.transform_point(T, obj.com), k)
     T_object = wp.transform_inverse(T)
     B = T_object * _body_pose(hand, b, packed.q_pregrasp, i)
-    way_in = wp.transform_vector(T_object, way)
-    first, end = stretch * _STEPS // stretches, (stretch + 1) * _STEPS // stretches
-    if wp.dot(way, up) < 0.0 or _way_blocked(hand, obj, limits, b, B, way_in, first, end):
-        wp.atomic_or(blocked_out, i, 1 << k)
+    first = stretch * (_STEPS // STRETCHES)
+    if _way_blocked(hand, obj, limits, b, B, wp.transform_vector(T_object, way), first):
+        refused_out[i] = 1
 
 
 @wp.kernel
@@ -164,13 +218,13 @@ def close_above(
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
     packed: Packed,
-    under_out: wp.array(dtype=wp.int32),
+    refused_out: wp.array(dtype=wp.int32),
 ):
     """One thread per (group, row kept): does the finger stay above the table on its way from ``q_pregrasp`` to ``q``?
 
     Args:
         row: (m,) hand of each row, -1 none.
-        under_out: (m,) 1: a finger does not; of zeros.
+        refused_out: (m,) 1: a finger does not.
     """
     g, i = wp.tid()
     s = row[i]
@@ -184,7 +238,7 @@ def close_above(
         group_forward(hand.kin, g, x + (float(part) / float(_PARTS)) * (q - x), X, hand.kin.joint_first[g])
         for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
             if body_height(hand.pieces, 1 + j, X[j], plane, limits.min_table_distance) < limits.min_table_distance:
-                under_out[i] = 1
+                refused_out[i] = 1
                 return
 
 
@@ -194,8 +248,8 @@ def choose_approach(
     palm: Palm,
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
-    blocked: wp.array(dtype=wp.int32),
-    under: wp.array(dtype=wp.int32),
+    clear: wp.array(dtype=wp.int32),
+    refused: wp.array(dtype=wp.int32),
     packed_out: Packed,
     counts_out: wp.array(dtype=wp.int32),
 ):
@@ -203,22 +257,19 @@ def choose_approach(
 
     Args:
         row: (m,) hand of each row, -1 none.
-        blocked: (m,) bit k: the hand cannot leave by retreat k.
-        under: (m,) 1: a finger that closes is not above the table.
+        clear: (m,) bit k: retreat k is clear.
+        refused: (m,) 1: the way is not clear after all, or a finger that closes is not above the table.
         counts_out: (reasons,) rows without a way are moved from those that are kept.
     """
     i = wp.tid()
     s = row[i]
     if s < 0:
         return
-    T = at.pose[at.of[s]]
-    pose = at.resting[at.of[s]]
-    up = wp.transform_vector(T, obj.resting.up[pose])
-    packed_out.resting[i] = pose
+    packed_out.resting[i] = at.resting[at.of[s]]
     packed_out.approach[i] = wp.vec3(wp.nan, wp.nan, wp.nan)
-    for k in range(RETREATS):
-        if (blocked[i] >> k) & 1 == 0 and under[i] == 0:
-            packed_out.approach[i] = -retreat(palm, up, wp.transform_point(T, obj.com), k)
-            return
+    k = first_clear(clear, i)
+    if k >= 0 and refused[i] == 0:
+        packed_out.approach[i] = -retreat(palm, _up(obj, at, s), wp.transform_point(at.pose[at.of[s]], obj.com), k)
+        return
     wp.atomic_sub(counts_out, Outcome.KEPT, 1)
     wp.atomic_add(counts_out, Outcome.APPROACH, 1)

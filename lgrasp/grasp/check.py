@@ -10,10 +10,11 @@ import numpy as np
 import warp as wp
 
 from lgrasp.grasp.approach_kernels import (
-    GPU_STRETCHES,
     RETREATS,
+    STRETCHES,
     Palm,
     check_table,
+    check_way,
     choose_approach,
     close_above,
     try_retreats,
@@ -168,13 +169,13 @@ class Check:
         centre, facing = palm_axis(self.hand.model)
         palm = make_struct(Palm, centre=wp.vec3(*map(float, centre)), facing=wp.vec3(*map(float, facing)))
         packed.resting, packed.approach = wp.empty(m, dtype=wp.int32, device=d), wp.empty(m, dtype=wp.vec3, device=d)
-        blocked, under = (wp.zeros(m, dtype=wp.int32, device=d) for _ in range(2))
+        clear, refused = (wp.zeros(m, dtype=wp.int32, device=d) for _ in range(2))
         inputs = [self.hand.struct, self.obj.struct, self.limits, palm, self.at, row, packed]
-        stretches = 1 if d == "cpu" else GPU_STRETCHES
-        wp.launch(try_retreats, (RETREATS, stretches, self.bodies, m), [*inputs, stretches], [blocked], device=d)
+        wp.launch(try_retreats, (m, RETREATS), inputs, [clear], device=d)
+        wp.launch(check_way, (STRETCHES, self.bodies, m), [*inputs, clear], [refused], device=d)
         inputs = [self.hand.struct, self.obj.struct, self.limits, self.at, row, packed]
-        wp.launch(close_above, (self.hand.model.groups, m), inputs, [under], device=d)
-        inputs = [self.obj.struct, palm, self.at, row, blocked, under]
+        wp.launch(close_above, (self.hand.model.groups, m), inputs, [refused], device=d)
+        inputs = [self.obj.struct, palm, self.at, row, clear, refused]
         wp.launch(choose_approach, m, inputs, [packed, tally.device], device=d)
 
     def _pack(self, seed: wp.array, row: wp.array) -> Packed:
