@@ -180,9 +180,12 @@ def known_hands(inputs: Inputs, cache_root: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("lgrasp.bench.comparison.Cache", known)
 
 
+notices.on_notice(lambda line: None)  # that nobody listens is tested where it matters
+
+
 @pytest.fixture(autouse=True)
 def unheard(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Notices of each test begin anew, and go nowhere unless it listens."""
+    """Notices of each test begin anew."""
     monkeypatch.setattr(notices, "_said", set())
     monkeypatch.setattr(notices, "_listeners", [lambda line: None])
 

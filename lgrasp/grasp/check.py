@@ -33,7 +33,7 @@ from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed
 from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.control_kernels import control_poses, drop_limp, limit_squeeze, press_shared
 from lgrasp.grasp.held import HeldArrays, hold_nothing
-from lgrasp.grasp.outcomes import MEASURED, METRICS, REASONS, SHARED, Outcome, bounds_squeeze, failed_squeeze
+from lgrasp.grasp.outcomes import LATE, MEASURED, METRICS, REASONS, SHARED, Outcome, bounds_squeeze, failed_squeeze
 from lgrasp.grasp.pregrasp_kernels import (
     FINGER_TRIES,
     OPENING_SHARES,
@@ -128,7 +128,7 @@ class Check:
             self._approach(row, packed, tally)
         columns, dropped = _columns(packed, on_table), bounded or self.obj.touch is not None
         fetched = read_tallies([tally], [*columns.values(), *([row] if dropped else [])], others=True)
-        count = sum(tally[reason] for reason in tally.names if reason in ("kept", "approach", "squeeze", "touch"))
+        count = sum(tally[reason] for reason in tally.names if reason in LATE)
         table = _table(dict(zip(columns, fetched, strict=False)), count)
         kept = fetched[-1][:count] >= 0 if dropped else np.ones(count, bool)
         if on_table:

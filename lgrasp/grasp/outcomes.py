@@ -40,6 +40,9 @@ region there is one more, SHARED."""
 
 SHARED = (*REASONS, "touch")
 
+LATE = ("kept", "approach", "squeeze", "weak", "touch")
+"""Outcomes in words of what is found once rows are packed."""
+
 NOT_HELD = "not held"
 """Outcome HOLD in words, of plans alone."""
 
@@ -110,8 +113,11 @@ def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds) -
     """Codes of FAILED_BOUNDS of checked rows with their outcomes, (n,) float32; 0 of rows that pass."""
     few = (table.contact_links >= 0).sum(1) < bounds.min_contacts
     wide = table.metrics["gap"] > bounds.max_gap
+    steep = table.metrics["normal_error"] > np.radians(bounds.max_normal_angle)
     at = {name: code for code, name in enumerate(FAILED_BOUNDS)}
-    contact = np.select([few, wide], [at["min_contacts"], at["max_gap"]], at["max_normal_angle"])
+    # what fails no bound by itself has its contacts on one finger
+    found = at["min_contacts"], at["max_gap"], at["max_normal_angle"]
+    contact = np.select([few, wide, steep], found, at["min_contacts"])
     codes = np.zeros(max(Outcome) + 1, np.float32)
     for failed, name in _FAILED.items():
         codes[failed] = at[name]

@@ -51,6 +51,7 @@ def place_touching(
     limits: Limits,
     places: Places,
     sets: SetCandidates,
+    least: wp.int32,
     at_out: CheckedPostures,
     found_out: Findings,
 ):
@@ -58,6 +59,9 @@ def place_touching(
 
     Contacts come in group order, that of the palm (or of a finger that stays as it is) after them, then those of other
     links; unused places hold -1.
+
+    Args:
+        least: contacts that a set must have.
     """
     i = wp.tid()
     row = at_out.of[i]
@@ -103,7 +107,7 @@ def place_touching(
     fit = fit_contacts(hand, places, at_out, i)
     found_out.gap[i] = fit[0]
     found_out.facing[i] = fit[1]
-    if fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
+    if k < least or fit[0] > limits.max_gap or wp.min(fit[1], fit[2]) < limits.min_cosine:
         found_out.outcome[i] = Outcome.CONTACT
         return
     for g in range(G):

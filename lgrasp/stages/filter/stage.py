@@ -64,7 +64,8 @@ def placed_hands(inputs: ContactSets, params: FilterParams, context: Context, *,
     check = Check(context.hand, context.object, context.held, limits, places, at, found)
     if opened:
         wp.launch(open_hands, n, [hand, sets], [at], device=d)
-    wp.launch(place_touching, n, [hand, field, held, limits, places, sets], [at, found], device=d)
+    least = 0 if params.contacts == "all" else context.bounds.min_contacts  # those of other links join later
+    wp.launch(place_touching, n, [hand, field, held, limits, places, sets, least], [at, found], device=d)
     check.clear_table(TOUCHING)
     check.measure(TOUCHING)
     seed = context.seed("filter")

@@ -6,6 +6,7 @@ import numpy as np
 
 from lgrasp.errors import PhysicsError
 from lgrasp.grasp.rows import grasp_rows
+from lgrasp.grasp.schema import PASS_SHIFT
 from lgrasp.grasp.tables import GraspTable, take_grasps
 from lgrasp.runtime.cores import cores
 from lgrasp.simulate.protocol import find_protocol
@@ -13,7 +14,7 @@ from lgrasp.simulate.run import verdicts
 from lgrasp.stages.context import Context
 from lgrasp.stages.simulate.params import SimulateParams
 
-VERSION = 3
+VERSION = 4
 """Raised also whenever a named protocol's numbers or the simulated scene change."""
 
 
@@ -31,7 +32,9 @@ def run(inputs: GraspTable, params: SimulateParams, context: Context) -> tuple[G
         raise PhysicsError("stage simulate needs a scene")
     protocol = find_protocol(params.protocol)
     threads = 1 if context.device == "cpu" else cores()  # on the CPU, batches run side by side
-    rows = grasp_rows(inputs, context.hand.model.tree, context.object.model.center)
+    # random draws go by the numbers that rows are stored with
+    named = replace(inputs, index=inputs.index + (context.salt << PASS_SHIFT))
+    rows = grasp_rows(named, context.hand.model.tree, context.object.model.center, shard=context.shard)
     found = verdicts(context.scene, rows, protocol, threads=threads, device=context.device, keep=context.kept.get)
     holds = found[f"{protocol.name}_holds"]
     counts = {

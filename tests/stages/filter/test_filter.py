@@ -193,6 +193,20 @@ def test_hands_that_are_too_weak_are_counted_as_such(finished, tables, context, 
     assert weak["weak"] > 0.9 * counts["kept"]
 
 
+def test_rows_that_are_strong_enough_stay_beside_weak_ones(finished, tables, context, swift):
+    """At efforts of which some rows ask too much."""
+    grasps, _, bounds = finished
+    least = float(np.quantile(grasps.metrics["squeeze_travel"], 0.2))
+    limp = context.changed(bounds=bounds.changed(min_squeeze_travel=least))
+    found = [
+        run(tables.search, swift.params("filter"), limp.changed(hand=with_efforts(context.hand, efforts)))
+        for efforts in np.geomspace(1e-3, 1.0, 7)
+    ]
+    assert any(told["weak"] and told["kept"] for _, told in found)
+    for table, told in found:
+        assert len(table) == told["kept"]
+
+
 def test_pregrasp_is_clear(finished, inputs, link_poses, link_distance):
     """Touching links are off the object by the margin, unless a finger cannot open."""
     grasps, _, bounds = finished
