@@ -26,6 +26,15 @@ def bodies(faces: np.ndarray) -> np.ndarray:
     return np.unique(label[faces[:, 0]], return_inverse=True)[1]
 
 
+def winding_number(corners: np.ndarray, point: np.ndarray) -> float:
+    """How often faces with corners (f, 3, 3) go around a point (3,): 1 inside a closed body, 0 outside."""
+    a, b, c = (corners - point).transpose(1, 0, 2)
+    x, y, z = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    over = np.einsum("fd,fd->f", a, np.cross(b, c))
+    under = x * y * z + (a * b).sum(1) * z + (b * c).sum(1) * x + (c * a).sum(1) * y
+    return float(np.arctan2(over, under).sum() / (2.0 * np.pi))
+
+
 def face_neighbours(faces: np.ndarray) -> np.ndarray:
     """Face across the edge from corner e to e + 1, shape (f, 3), int32; -1 across an open edge.
 

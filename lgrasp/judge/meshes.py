@@ -314,5 +314,30 @@ def mass_centre(mesh: trimesh.Trimesh) -> np.ndarray:
 def load_mesh(source: Path | bytes, name: str) -> trimesh.Trimesh:
     """Mesh of a file or of its bytes; all parts of a scene in one, of COLLADA in metres."""
     file, kind = io.BytesIO(source) if isinstance(source, bytes) else str(source), Path(name).suffix.lstrip(".").lower()
+    if kind == "obj":
+        file = io.BytesIO(_counted_from_start(source if isinstance(source, bytes) else source.read_bytes()))
     mesh = trimesh.load_scene(file, file_type=kind).to_mesh()
     return mesh.apply_scale(unit_conversion(mesh.units, "meters")) if kind == "dae" and mesh.units else mesh
+
+
+def _counted_from_start(data: bytes) -> bytes:
+    """An OBJ whose faces name vertices from the file's start: trimesh counts negative numbers from its end."""
+    counts, lines = {b"v": 0, b"vt": 0, b"vn": 0}, []
+    for line in data.splitlines():
+        what, *words = line.split() or [b""]
+        if what in counts:
+            counts[what] += 1
+        elif what == b"f" and b"-" in line:
+            lines.append(b"f " + b" ".join(_absolute(word, [*counts.values()]) for word in words))
+            continue
+        lines.append(line)
+    return b"\n".join(lines)
+
+
+def _absolute(corner: bytes, counts: list[int]) -> bytes:
+    """One corner of a face: numbers of vertex, texture and normal, of so many so far."""
+    numbers = corner.split(b"/")
+    return b"/".join(
+        str(count + 1 + int(number)).encode() if number.startswith(b"-") else number
+        for number, count in zip(numbers, counts, strict=False)
+    )

@@ -14,19 +14,25 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
+from trimesh.graph import connected_component_labels
 from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError, short_reason
-from lgrasp.geometry.edges import bodies, open_edges
+from lgrasp.geometry.edges import bodies, open_edges, winding_number
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.object.find import MESH_SUFFIXES
+from lgrasp.object.mass import united_bodies
+from lgrasp.object.obj_file import read_obj
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import check_file
 
 _FLAT = 1e-4  # thinner than this share of the largest side is a plane
 _ROUNDING = 1e-4  # of a largest side, by files of single precision
+_SAME = 1e-8  # [m] between vertices that are one
 _FARTHEST = 100.0  # [m] from the origin; a shard's numbers are 0.01 mm apart there
 _MOST_UNPACKED = 256 << 20
+_LFS_POINTER = b"version https://git-lfs"
 _UNITS = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"))
 
 
@@ -98,6 +104,8 @@ def load_mesh(
     faces = _orient(vertices, faces, notes)
     vertices, faces = close_holes(vertices, faces, params.hole_perimeter, notes)
     loose = len(open_edges(faces))
+    if not loose:
+        vertices, faces = _unite(vertices, faces, notes)
     if loose:
         notes.append(f"not watertight ({loose} open edges): inside is decided by winding number")
     return LoadedMesh(name, sha, vertices, faces.astype(np.int32), loose == 0, tuple(notes))
@@ -159,7 +167,12 @@ def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
         ObjectError: it cannot be read, or holds no faces.
     """
     kind = path.suffix.lower()[1:]
-    options: dict[str, Any] = {"skip_materials": True} if kind == "obj" else {}
+    if files[""].startswith(_LFS_POINTER):
+        raise ObjectError(f"{path}: a pointer of Git LFS, not the mesh itself; git lfs pull fetches it")
+    if kind == "obj":  # read by the file's own numbers, which regions go by too
+        raw = read_obj(path, files[""])
+        return [trimesh.Trimesh(raw.vertices, raw.faces, process=False)]
+    options: dict[str, Any] = {}
     if kind == "gltf":
         options["resolver"] = _Buffers(path, files)
     try:
@@ -225,11 +238,17 @@ def _remedy(extent: float, scale: float) -> str:
 def _weld(label: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Merge equal vertices, drop unused ones and faces that name a vertex twice."""
     used = np.unique(faces)
-    grid = np.round((vertices[used] - vertices[used].mean(axis=0)) * 1e8).astype(np.int64)  # 10 nm
+    grid = np.round((vertices[used] - vertices[used].mean(axis=0)) / _SAME).astype(np.int64)
     _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    keep = np.sort(first)  # in the file's order
     lookup = np.zeros(len(vertices), np.int64)
-    lookup[used] = np.argsort(np.argsort(first))[inverse.ravel()]
+    lookup[used] = inverse.ravel()
+    if len(open_edges(lookup[faces])):  # equal vertices may lie in two cells of the grid
+        near = cKDTree(vertices[used[first]]).query_pairs(_SAME, output_type="ndarray")
+        label = connected_component_labels(near, len(first))
+        lookup[used] = label[inverse.ravel()]
+        first = _least(label, first)
+    keep = np.sort(first)  # in the file's order
+    lookup = np.argsort(np.argsort(first))[lookup]
     faces = lookup[faces]
     if len(keep) < len(used):
         notes.append(f"merged {len(used) - len(keep)} duplicate vertices")
@@ -245,19 +264,31 @@ def _weld(label: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str])
     return vertices, faces
 
 
+def _least(label: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The least value of each label, from 0 on."""
+    out = np.full(int(label.max()) + 1, np.iinfo(np.int64).max)
+    np.minimum.at(out, label, values)
+    return out
+
+
 def _drop_twins(faces: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Drop repeated faces, and every second side of a mesh that is two-sided throughout."""
+    """Drop repeated faces, and every second side of bodies that are two-sided throughout."""
     start = np.argmin(faces, axis=1)[:, None] if len(faces) else np.zeros((0, 1), np.int64)
     turned = np.take_along_axis(faces, (start + np.arange(3)) % 3, axis=1)  # smallest index first, same winding
     first = np.sort(np.unique(turned, axis=0, return_index=True)[1])
     if len(first) < len(faces):
         notes.append(f"dropped {len(faces) - len(first)} repeated faces")
     faces = faces[first]
-    sides = np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])
-    if len(faces) and 2 * len(sides) == len(faces):
-        notes.append(f"dropped {len(sides)} back faces of a two-sided mesh")
-        faces = faces[sides]
-    return faces
+    _, sides, number = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    if len(sides) == len(faces):
+        return faces
+    body, back = bodies(faces), np.ones(len(faces), bool)
+    back[sides] = False
+    single = np.bincount(body[sides[number == 1]], minlength=int(body.max()) + 1) > 0
+    back &= ~single[body]
+    if back.any():
+        notes.append(f"dropped {int(back.sum())} back faces of a two-sided mesh")
+    return faces[~back]
 
 
 def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -279,14 +310,28 @@ def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.nda
     np.minimum.at(low, body, corners.min(axis=1))
     np.maximum.at(high, body, corners.max(axis=1))
     flip = volume < -1e-9 * np.ptp(vertices, axis=0).max() ** 3
-    if not flip.all():
-        solid = np.flatnonzero(~flip)
-        for k in np.flatnonzero(flip):
-            flip[k] = not ((low[solid] < low[k]) & (high[solid] > high[k])).all(axis=1).any()
+    outermost = np.arange(count)
+    for k in range(count if flip.any() else 0):  # a body in another is turned as that is
+        about = np.flatnonzero(((low < low[k]) & (high > high[k])).all(axis=1))
+        point = corners[np.argmax(body == k), 0]
+        within = [o for o in about if abs(winding_number(corners[body == o], point)) > 0.5]
+        outermost[k] = max(within, key=lambda o: abs(volume[o]), default=k)
+    flip = flip[outermost]
     if flip.any():
         notes.append(f"turned {int(flip.sum())} of {count} bodies that were inside out")
         faces = np.where(flip[body][:, None], faces[:, ::-1], faces)
     return faces
+
+
+def _unite(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Bodies of a closed mesh that overlap or touch become one: no surface is left inside."""
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    with quiet_parsers():
+        found = united_bodies(vertices - middle, faces)
+    if found is None:
+        return vertices, faces
+    notes.append(f"united {int(bodies(faces).max()) + 1} bodies that overlap or touch")
+    return found[0] + middle, found[1]
 
 
 def close_holes(

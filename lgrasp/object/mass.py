@@ -58,22 +58,22 @@ def _solid_mesh(points: np.ndarray, faces: np.ndarray) -> tuple[float, np.ndarra
     joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
     if not len(joined) or len(open_edges(joined)):
         return None
-    found, union = _solid(points, faces), _union(places, joined)
-    if found is None or union is None or union.volume > (1.0 - _OVERLAP) * found[0]:
-        return found
-    return _solid(np.asarray(union.vertices), np.asarray(union.faces))
+    union = united_bodies(places, joined)
+    return _solid(points, faces) if union is None else _solid(*union)
 
 
-def _union(points: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh | None:
-    """All bodies of a closed mesh as one; None if their boxes are apart, or they have no union."""
+def united_bodies(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices (v, 3) and faces (f, 3) of all bodies of a closed mesh as one, where bodies overlap or touch; None where
+    they do not, or have no union."""
     body = bodies(faces)
     if not body.any():  # one
         return None
-    shells = [trimesh.Trimesh(points, faces[body == k], process=False) for k in range(int(body.max()) + 1)]
+    corners = points[faces] - points.mean(axis=0)
+    volume = np.bincount(body, np.linalg.det(corners) / 6.0)
+    shells = [trimesh.Trimesh(points, faces[body == k], process=False) for k in range(len(volume))]
     low, high = (np.array([shell.bounds[end] for shell in shells]) for end in (0, 1))
-    volume = np.array([shell.volume for shell in shells])
     solid = np.flatnonzero(volume > 0.0)
-    meets = ((low[solid, None] < high[solid]) & (low[solid] < high[solid, None])).all(axis=-1)
+    meets = ((low[solid, None] <= high[solid]) & (low[solid] <= high[solid, None])).all(axis=-1)
     if meets.sum() == len(solid):  # with itself alone
         return None
     parts = {k: [shells[k]] for k in solid}
@@ -82,9 +82,14 @@ def _union(points: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh | None:
         if about:
             parts[min(about, key=volume.__getitem__)].append(shells[k])
     try:
-        return trimesh.boolean.union([trimesh.util.concatenate(each) for each in parts.values()], engine="manifold")
+        union = trimesh.boolean.union([trimesh.util.concatenate(each) for each in parts.values()], engine="manifold")
     except (ValueError, RuntimeError):
         return None
+    whole = np.asarray(union.vertices, float), np.asarray(union.faces, np.int64)
+    if not len(whole[1]) or len(open_edges(whole[1])):
+        return None
+    smaller = union.volume < (1.0 - _OVERLAP) * volume.sum()
+    return whole if smaller or bodies(whole[1]).max() < body.max() else None
 
 
 def _solid_hull(points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
