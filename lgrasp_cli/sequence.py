@@ -118,7 +118,7 @@ def _profile(data: dict[str, Any]) -> list[Block]:
         ("how", f"pipeline {data['pipeline']}, method {data['method']}, policy {data['policy']}"),
         ("penetration", f"median {data['penetration'][0]:.2f} mm, largest {data['penetration'][1]:.2f} mm"),
     ]
-    columns = ("object", "space", "sequences", "continued", "share")
+    columns = ("object", "space", "tried in", "possible", "share")  # a sequence may be tried in several spaces
     rows = []
     for name, spaces in zip(data["objects"], data["spaces"], strict=False):
         for space, counts in spaces.items():

@@ -264,7 +264,7 @@ def check_grasps(
         pose: T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (n, 7).
         q: joint positions within their limits [rad or m], (n, K).
         contacts: what touches (:func:`known_contacts`, :func:`~lgrasp.grasp.find_contacts.find_contacts`).
-        around: what else the hand must not penetrate, in the object's internal frame.
+        around: what else the hand must not penetrate, at q_pregrasp neither, in the object's internal frame.
         resting: plane of ``obj`` that is each row's table, which the hand and its way there must clear, (n,) int.
         index: candidate of each row; default: the row.
         seed: of the random rays of epsilon; default: 0.
@@ -272,6 +272,10 @@ def check_grasps(
     check = _measured(hand, obj, pose, q, contacts, bounds, around, resting)
     seed = wp.zeros(1, dtype=wp.int32, device=hand.device) if seed is None else seed
     table, outcome = check.every(seed, on_table=resting is not None)
+    if around is not None:
+        opened = _measured(hand, around, pose, table.q_pregrasp, contacts, bounds, None, None)
+        deep = fetch([opened.found.penetration])[0] > bounds.max_penetration
+        outcome = np.where(deep & (outcome == Outcome.KEPT), Outcome.OBJECT_COLLISION, outcome)
     table.index[:] = np.arange(len(check)) if index is None else index
     return table, outcome
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 RULES = "hand_rules"
 """Key of a shard's config: the contents of the hand's hand.yaml, as JSON text (the order of its keys counts)."""
+SURROUNDED = "surrounded"
+"""Key of the config of plans that had to avoid other things, which the shard does not hold."""
 
 
 def hand_config(source: HandSource) -> dict[str, Any]:

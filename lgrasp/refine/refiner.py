@@ -147,10 +147,13 @@ class Refiner(nn.Module):
             return Refined(pose, self.energy(*pose))
 
     def max_penetration(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Depth of the deepest point of hands in anything, or of that in them [m], negative apart, (N,)."""
+        """Depth of the deepest point of hands in anything, or of that in them [m], (N,): negative apart, NaN of hands
+        that are not finite."""
         self._check(R, t, q)
         with torch.no_grad():
-            return torch.as_tensor(self.search.max_penetration(self._put(Pose(R, t, q))), device=self._device)
+            lost = torch.cat([x.flatten(1) for x in (R, t, q)], 1).sum(1) * 0  # NaN of hands that have one
+            depth = torch.as_tensor(self.search.max_penetration(self._put(Pose(R, t, q))), device=self._device)
+            return depth + lost.to(depth)
 
     @property
     def search(self) -> Descent:
@@ -255,6 +258,8 @@ class Refiner(nn.Module):
         return self._points @ turned + t_block[:, :, None], self._normals @ turned
 
     def _gradient(self, pose: Pose, matches: Matches) -> Gradient:
+        if torch.is_inference_mode_enabled():
+            raise ConfigError("unrolled steps need gradients: torch.inference_mode() is refused, no_grad() accepted")
         with torch.enable_grad():
             R, t, q = (x if x.requires_grad else x.detach().requires_grad_() for x in pose)
             total = self.energy(R, t, q, matches=matches).total.sum()

@@ -6,6 +6,7 @@ import os
 import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,30 @@ def test_a_cut_run_lists_what_is_missing_and_ends_like_a_whole_one(tmp_path):
     before = cut.stat().st_mtime_ns
     run(SampleJob(out=tmp_path / "cut"))
     assert cut.stat().st_mtime_ns == before
+
+
+def test_of_two_runs_side_by_side_each_file_is_listed_as_it_is(tmp_path):
+    """The second makes the first's files again once these are listed, and ends before it."""
+
+    class Another(SampleJob):
+        def make(self, part, progress):
+            made = super().make(part, progress)
+            if part.number == 2:
+                run(Second(out=tmp_path), resume=False)
+            return made
+
+    class Second(SampleJob):
+        def make(self, part, progress):
+            made = super().make(part, progress)
+            header = replace(made.contents.header, created="2027-01-02T03:04:05+00:00")
+            return replace(made, contents=replace(made.contents, header=header))
+
+    run(Another(out=tmp_path))
+    found = differences(tmp_path)
+    assert not found.missing + found.foreign
+    assert not found.changed
+    for shard in document(tmp_path)["runs"][0]["shards"]:
+        assert hashlib.sha256((tmp_path / shard["file"]).read_bytes()).hexdigest() == shard["sha256"]
 
 
 @pytest.mark.parametrize("rows", [6, 5])

@@ -213,6 +213,93 @@ def test_scene_is_joined(tmp_path):
     assert "joined 2 geometries into one object" in loaded.notes
 
 
+def test_obj_counts_back_from_where_a_face_stands(tmp_path):
+    """Two boxes, the faces of each right after its corners."""
+    lid = BOX.copy().apply_scale(0.5).apply_translation([0, 0, 0.2])
+    lines = []
+    for part in (BOX, lid):
+        lines += [f"v {x} {y} {z}" for x, y, z in part.vertices]
+        lines += ["\tf  " + "\t".join(f"{k - 8}//" for k in face) for face in part.faces]
+    path = tmp_path / "two.obj"
+    path.write_text("\r\n".join(lines))
+    mesh = load_mesh(path)
+    assert mesh.closed
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(1.125 * BOX.volume)
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_concave_polygons_keep_their_corner_empty(tmp_path, turn):
+    """An L of two caps of six corners and six walls of four."""
+    flat = np.array([[30, 80], [0, 80], [0, 0], [80, 0], [80, 30], [30, 30]]) / 1000
+    flat = np.roll(flat, 2, axis=0)
+    corners = np.concatenate([np.c_[flat, np.zeros(6)], np.c_[flat, np.full(6, 0.03)]])
+    faces = [[5, 4, 3, 2, 1, 0], [6, 7, 8, 9, 10, 11], *([k, (k + 1) % 6, 6 + (k + 1) % 6, 6 + k] for k in range(6))]
+    path = tmp_path / "l.obj"
+    text = [f"v {x} {y} {z}" for x, y, z in corners] + ["f " + " ".join(str(k + 1) for k in f[::turn]) for f in faces]
+    path.write_text("\n".join(text))
+    mesh = load_mesh(path)
+    assert mesh.closed
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert solid.volume == pytest.approx(0.03 * 0.0039, rel=1e-6)
+    assert solid.area == pytest.approx(2 * 0.0039 + 0.03 * 0.32, rel=1e-6)
+    assert not (solid.triangles_center[:, :2] > 0.031).all(axis=1).any()
+
+
+def test_a_reversed_file_keeps_its_cavity():
+    solid = trimesh.util.concatenate([BOX, BOX.copy().apply_scale(0.5)])
+    solid.faces[12:] = solid.faces[12:, ::-1]
+    for faces in (solid.faces, solid.faces[:, ::-1]):
+        mesh = load_mesh(trimesh.Trimesh(solid.vertices, faces, process=False))
+        assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume == pytest.approx(0.875 * BOX.volume)
+
+
+def test_a_solid_beside_a_reversed_one_stays_as_it_is():
+    """Both in one box, neither in the other."""
+    ring = trimesh.creation.annulus(0.03, 0.04, 0.02)
+    ball = trimesh.creation.icosphere(2, 0.009)
+    both = trimesh.util.concatenate([ring, ball])
+    for turned in (slice(0, len(ring.faces)), slice(len(ring.faces), None)):
+        faces = both.faces.copy()
+        faces[turned] = faces[turned, ::-1]
+        mesh = load_mesh(trimesh.Trimesh(both.vertices, faces, process=False))
+        found = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        assert found.volume == pytest.approx(ring.volume + ball.volume)
+
+
+def test_bodies_that_overlap_become_one():
+    handle = trimesh.creation.cylinder(0.01, 0.2, sections=24)
+    mesh = load_mesh(trimesh.util.concatenate([BOX, handle]))
+    assert mesh.closed
+    assert "united 2 bodies that overlap or touch" in mesh.notes
+    found = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert found.volume == pytest.approx(BOX.volume + handle.volume / 2, rel=1e-4)
+    assert found.area < BOX.area + 0.6 * handle.area  # none of the handle inside
+
+
+def test_corners_a_nanometre_apart_are_one():
+    ball = trimesh.creation.icosphere(3, 0.03)
+    corners = ball.vertices[ball.faces].reshape(-1, 3)
+    corners = corners + np.random.default_rng(0).normal(0, 1e-9, corners.shape)
+    mesh = load_mesh(trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False))
+    assert mesh.closed
+    assert len(mesh.vertices) == len(ball.vertices)
+
+
+def test_two_sided_parts_beside_solid_ones():
+    ball = trimesh.creation.icosphere(3, 0.03)
+    faces = ball.faces[ball.triangles_center[:, 2] < 0]
+    shell = trimesh.Trimesh(ball.vertices, np.concatenate([faces, faces[:, ::-1]]), process=False)
+    mesh = load_mesh(trimesh.util.concatenate([shell, BOX.copy().apply_translation([0.1, 0, 0])]))
+    assert not mesh.closed
+    assert f"dropped {len(faces)} back faces of a two-sided mesh" in mesh.notes
+
+
+def test_a_pointer_of_git_lfs_says_so(tmp_path):
+    path = tmp_path / "mesh.stl"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n")
+    assert "git lfs pull" in refused(path)
+
+
 def test_unknown_parameter_is_refused():
     with pytest.raises(ValueError, match="contact_cout"):
         ObjectParams(contact_cout=3)

@@ -68,6 +68,20 @@ def test_group_or_material_of_an_obj(tmp_path, unit, name):
     assert (weights("group:all", points, mesh, scale=unit) >= MEMBER).all()
 
 
+def test_names_of_groups_as_others_write_them(tmp_path):
+    """With # inside, after a mark of UTF-8, in Latin-1, and where lines go on."""
+    points, mesh = surface(), write_obj(tmp_path / "two.obj")
+    text = mesh.read_text()
+    assert "g left" in text
+    for name, data in (
+        ("part#1", b"\xef\xbb\xbf" + text.replace("g left", "g part#1 # a comment").encode()),
+        ("gr\xf6\xdfe", text.replace("g left", "g gr\xf6\xdfe").encode("latin-1")),
+        ("left", text.replace("f ", "f \\\n ").encode()),
+    ):
+        mesh.write_bytes(data)
+        assert ((weights(f"group:{name}", points, mesh) >= MEMBER) == (points[:, 0] < 0)).all()
+
+
 @pytest.mark.parametrize("suffix", [".obj", ".ply"])
 def test_colour_of_vertices(tmp_path, suffix):
     mesh = tmp_path / f"two{suffix}"

@@ -80,6 +80,15 @@ def test_penetration_is_left(make, valid, inputs):
     assert np.quantile(table.metrics["penetration"], 0.9) < 0.001
 
 
+def test_hands_that_are_not_finite_have_no_depth(make, valid):
+    refiner, pose = make(), some(valid, slice(3))
+    for name, value in (("t", torch.nan), ("q", torch.inf)):
+        changed = getattr(pose, name).clone()
+        changed[1, 0] = value
+        depth = refiner.max_penetration(*pose._replace(**{name: changed}))
+        assert depth.isnan().tolist() == [False, True, False]
+
+
 def test_hands_are_taken_out_before_the_search(make, valid, coarse):
     """Coarse hands through the mug's walls come free, by opening where a straight way is not enough; others stay."""
     tiny = {"matching_rounds": 1, "gradient_steps": 1}

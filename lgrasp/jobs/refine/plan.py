@@ -23,22 +23,23 @@ from lgrasp.hand.arrays import upload_hand
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.clouds import cloud_record, cloud_to_grasp, network_key
-from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs, object_record
+from lgrasp.jobs.records import SURROUNDED, hand_config, hand_record, mesh_blobs, object_record
 from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.requests.plan import PlanRequest
 from lgrasp.jobs.shard_inputs import mesh_hash, named_hand, named_object, palmar_side
 from lgrasp.learn.grasp.file import Networks, load_networks
 from lgrasp.learn.networks import check_network_hand, find_network
+from lgrasp.notices import notice
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams, cloud_params
 from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import STAND_OFF
 
-VERSION = 11
+VERSION = 12
 """Raised whenever plans change for the same parameters."""
 
 _OBSTACLE_REACH = 0.3  # [m] what is farther from the target than this is not in the hand's way
-_LEAST_AROUND = 50
+_LEAST_AROUND = 32  # points
 
 
 class PlanJob(PlanRequest, Job):
@@ -95,12 +96,12 @@ class PlanJob(PlanRequest, Job):
             self.starts, lambda done, plans: progress(done, f"{plans:,} plans"), keep_invalid=self.keep_invalid
         )
         seconds = time.perf_counter() - begin
-        config = {
+        config: dict[str, Any] = {
             "run_key": self.key(),
             "bounds": planner.effort.bounds.describe(),
             "plan": plan.model_dump(mode="json"),
         }
-        config |= self._told() | hand_config(source)
+        config |= self._told() | hand_config(source) | ({} if around is None else {SURROUNDED: True})
         header = ShardHeader(pipeline="plan", seed=0, shard_index=0, config=config)
         statistics = {
             "device": self.device_used.name,
@@ -197,6 +198,8 @@ def _cloud_models(cloud: Cloud, name: str) -> tuple[ObjectModel, ObjectModel | N
     rest = cloud.only(~cloud.target)
     near = (abs(rest.points - model.center) < model.extents.max() + _OBSTACLE_REACH).all(1)
     if near.sum() < _LEAST_AROUND:
+        if near.any():
+            notice(f"{near.sum()} points near the target are too few for a surface and are not avoided")
         return model, None
     around = cloud_object(rest.points[near] - model.center, rest.normals[near], name="around", centred=False)
     return model, around

@@ -28,10 +28,11 @@ from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader, now
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
-from lgrasp.jobs.records import hand_config, hand_record, mesh_blobs
+from lgrasp.jobs.records import SURROUNDED, hand_config, hand_record, mesh_blobs
 from lgrasp.jobs.refine.moved import move_rows
 from lgrasp.jobs.requests.shards import RefineRequest
 from lgrasp.jobs.shard_inputs import arrays_of_shard, named_hand, object_of_shard
+from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.load import load_mesh
 from lgrasp.steer.touch import moved_rows
@@ -66,6 +67,8 @@ class RefineJob(RefineRequest, ShardJob):
 
     def check_source(self, reader: ShardReader) -> None:
         super().check_source(reader)
+        if reader.header.config.get(SURROUNDED):
+            notice(f"{reader.path}: planned beside other things, of which the shard has none: hands may move into them")
         if reader.space_names is not None or len(reader.object_ids) != 1 or reader.columns["object_index"][0][1] != 1:
             raise ShardError(
                 f"{reader.path}: rows of several objects cannot be refined; one object to a shard is accepted"

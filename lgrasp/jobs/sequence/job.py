@@ -109,17 +109,20 @@ class SequenceJob(SequenceRequest, SearchJob):
             was asked.
         """
         inputs, params, sums = self.inputs, self.pipeline.params("sequence"), self.sums(outcome)
-        depth = []
+        depth, made = [], {part.file for part, _ in outcome.made_parts}
+        reached = np.zeros(len(inputs.objects), int)
+        for result in outcome.results:
+            reached[: len(result.reached)] += result.reached
         for path in outcome.paths:
             with ShardReader(path) as reader:
                 depth.append(reader.column("metrics/penetration"))
+                if path not in made:
+                    reached += [int(reader.statistics.get(f"found_{n}", 0)) for n in range(1, len(reached) + 1)]
         depth = np.concatenate(depth or [np.zeros(1)])
         wall = sums["seconds"]["wall"]
         return {
             "sequences": outcome.rows,
-            "reached": [
-                sum(r.reached[s] for r in outcome.results if s < len(r.reached)) for s in range(len(inputs.objects))
-            ],
+            "reached": reached.tolist(),
             **{name: _steps(inputs, outcome.results, name) for name in ("steps", "spaces")},
             "penetration": [1e3 * float(np.median(depth)), 1e3 * float(depth.max())],
             "per_s": outcome.made / wall if wall else 0.0,
