@@ -10,6 +10,7 @@ from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part
 from lgrasp.engine.folder import Found
 from lgrasp.engine.shard_job import ShardJob, rows_digest
+from lgrasp.errors import ShardError
 from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.requests.shards import VerdictRequest
 
@@ -35,6 +36,12 @@ class VerdictJob(VerdictRequest, ShardJob):
 
     def key(self) -> str:
         return content_key(self.command, self.version, settings=self.settings())
+
+    def parts(self) -> list[Part]:
+        parts = super().parts()
+        if not any(part.rows for part in parts):
+            raise ShardError(f"{', '.join(map(str, self.shards))}: no grasps to give verdicts of")
+        return parts
 
     def found(self, part: Part) -> Found | None:
         if not self.in_place:  # else the source was checked
