@@ -15,6 +15,8 @@ from lgrasp.stages.context import Context
 
 _MOST_GRAPHS = 2
 """Graphs kept at a time: each holds the tables of a batch, and one is replayed while those of another are read."""
+_SPOILT = "graph capture failed"
+"""Of errors of Warp: memory that another thread frees just as a capture begins spoils it."""
 _SAME_SIZE = (0.98, 1.05)
 """Share of the candidates wanted that a size may be and serve as well."""
 
@@ -54,12 +56,11 @@ class GraphCache:
     def run(self, context: Context, first: int, count: int) -> tuple[ContactSets, Meter]:
         """The sets of candidates ``first .. first + count - 1``, and their counts and seconds."""
         self.done()
-        new = count not in self._sizes
+        captured = self._take(context, count) if count in self._sizes else None
         self._sizes = [*(n for n in self._sizes if n != count), count]
-        if new:
+        if captured is None:
             meter = Meter(context.device)
             return run_stages(self._pipeline, context, first, count, "search", meter), meter
-        captured = self._take(context, count)
         captured.first.fill_(first)
         for (stage, salt), seed in captured.context.seeds.items():
             seed.fill_(stage_seed(context.base_seed, context.shard, stage, salt))
@@ -72,15 +73,17 @@ class GraphCache:
         if self._held.pop(threading.get_ident(), None):
             self._free.release()
 
-    def _take(self, context: Context, count: int) -> _CapturedGraph:
-        """A graph of this size, from now on the thread's own."""
+    def _take(self, context: Context, count: int) -> _CapturedGraph | None:
+        """A graph of this size, from now on the thread's own; None if it could not be captured."""
         if not self._free.acquire(blocking=False):
             with others_turn():
                 self._free.acquire()
         try:
             captured = self._idle(context, count)
-        except BaseException:
+        except BaseException as error:
             self._free.release()
+            if isinstance(error, RuntimeError) and _SPOILT in str(error):
+                return None
             raise
         self._held[threading.get_ident()] = captured
         return captured

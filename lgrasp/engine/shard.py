@@ -239,6 +239,10 @@ def make_shard(
             result.spans.append((start, time.time()))
             bank.store(found.account(interrupted=True))
         raise
+    finally:
+        with turn:  # memory of the device is not freed while another thread captures a graph
+            found.close()
+            context.close()
     result.grasps = found.shuffled()
     result.spans.append((start, time.time()))
     result.exhausted = found.count < rows
@@ -266,6 +270,10 @@ class _Rows:
     @property
     def count(self) -> int:
         return self._kept.count
+
+    def close(self) -> None:
+        """Free what is on the device; nothing is added from now on."""
+        self._kept.close()
 
     def add(self, grasps: GraspTable) -> None:
         """Add the new ones of further rows, up to the number requested."""

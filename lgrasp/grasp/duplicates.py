@@ -99,6 +99,10 @@ class KeptRows:
         self._q = np.zeros((0, joints), np.float32)
         self.count = 0
 
+    def close(self) -> None:
+        """Free what is on the device; no rows can be added from now on."""
+        del self._near
+
     def restore(self, pose: np.ndarray, q: np.ndarray) -> None:
         """Begin with rows that were kept before: poses (N, 7) and joints (N, K)."""
         self._pose, self._q = np.array(pose, np.float32), np.array(q, np.float32)

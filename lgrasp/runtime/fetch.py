@@ -15,7 +15,7 @@ from lgrasp.runtime.turn import others_turn
 
 _ALIGNMENT = 256  # bytes that places in the staging memory are rounded up to
 _LEAST_STAGING = 1 << 20  # bytes
-_CAPTURE_STEP = 0.0005  # [s]; a graph is captured in some 10 ms
+_CAPTURE_STEP, _LONGEST_CAPTURE = 0.0005, 30.0  # [s]; a graph is captured in some 10 ms
 _staging: list[wp.array] = []  # what nobody uses just now
 
 
@@ -52,12 +52,13 @@ def fetch(arrays: Sequence[wp.array], *, others: bool = False) -> list[np.ndarra
 
 def wait_for(event: wp.Event) -> None:
     """Until an event has come; Warp refuses to wait while another thread captures a graph."""
+    end = time.monotonic() + _LONGEST_CAPTURE
     while True:
         try:
             wp.synchronize_event(event)
             return
         except RuntimeError as error:
-            if "graph capture" not in str(error):
+            if "graph capture" not in str(error) or time.monotonic() > end:
                 raise
         time.sleep(_CAPTURE_STEP)
 

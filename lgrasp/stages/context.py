@@ -83,6 +83,12 @@ class Context:
         copy.__dict__["networks"] = self.networks
         return copy
 
+    def close(self) -> None:
+        """Free what nobody else has on the device; seeds and what stands for nothing are made again if asked for."""
+        self.seeds.clear()
+        for name in ("held", "steered", "networks"):
+            self.__dict__.pop(name, None)
+
     def once(self, kind: str, make: Callable[[], Any], *settings: Any) -> Any:
         """What a stage makes of hand, object and settings, and keeps from batch to batch of a job."""
         hand, obj = self.hand.model, self.object.model
