@@ -3,9 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
 from support.shards import sample_shard
 
+from lgrasp import notices
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.info import describe
 from lgrasp.dataset.status import folder_states
@@ -29,6 +31,22 @@ def test_folders_of_folders(tmp_path, said):
     assert [shard.path for shard in gather([one, one, tmp_path / "top"])] == [one, two]
     assert len(GraspDataset(tmp_path / "top")) == 6
     assert said == []
+
+
+def test_in_python_what_is_left_out_is_a_warning(tmp_path, monkeypatch):
+    write(tmp_path / "0.h5", 0)
+    cut = write(tmp_path / "1.h5", 1)
+    cut.write_bytes(cut.read_bytes()[:-50])
+    monkeypatch.setattr(notices, "_listeners", [])
+    for _ in range(2):
+        with pytest.warns(UserWarning, match=r"1 of 2 files are left out, first .*1\.h5"):
+            assert len(GraspDataset(tmp_path)) == 3
+
+
+def test_a_shard_that_the_program_has_open_is_read(tmp_path):
+    path = write(tmp_path / "0.h5", 0)
+    with h5py.File(path) as file:
+        assert len(GraspDataset(tmp_path)) == len(file["grasps/q"]) == 3
 
 
 def test_links_to_folders_are_followed_once(tmp_path):

@@ -178,6 +178,11 @@ def test_a_scene(opened, tmp_path):
     assert palm[2, 3] == pytest.approx(0.4)
     assert asked(site, "/row/0")[:2] == (302, "/")
     assert view.meshes().graph.get("base")[0][2, 3] == pytest.approx(0.3)
+    assert "table" in shown.geometry
+    assert opened(tmp_path, row=1)[1].meshes().graph.get("base")[0][2, 3] == pytest.approx(0.4)
+    for options, message in (({"row": 2}, "row 2 does not exist"), ({"where": ["metrics/epsilon"]}, "has no metrics")):
+        with pytest.raises(ConfigError, match=message):
+            opened(tmp_path, **options)
 
 
 @pytest.mark.parametrize(
@@ -185,6 +190,7 @@ def test_a_scene(opened, tmp_path):
     [
         ("allegrp", {}, "'allegrp' is no file, folder, hand or object; did you mean 'allegro'"),
         (SHARD, {"row": 10}, "row 10 does not exist; there are 0 to 9"),
+        ("allegro", {"row": 3}, "--row is for grasps; hand allegro has no rows"),
         (SHARD, {"where": ["epsilon >"]}, "expected COLUMN or COLUMN OP NUMBER"),
         (SHARD, {"where": ["metrics/epsilon > 9"]}, "no row of 10 meets"),
     ],

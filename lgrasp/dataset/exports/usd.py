@@ -24,8 +24,8 @@ _HAND = "/World/hand"
 _POINT = 0.002  # [m] of a point cloud
 
 USD_NOTES = """\
-grasps/CODE.usdc   USD stage of all grasps of one object: metres, z up. Time code t is the t-th grasp; between
-                   two codes is neither.
+grasps/CODE.usdc   USD stage of all grasps of one object: metres, z up. Time code t is the t-th grasp; in
+                   between there is none.
 
   /World/CODE      the object's mesh, at the origin, not turned
   /World/hand/*    the links that have a surface: their transform in the object's frame is a time sample, the mesh is
