@@ -20,11 +20,11 @@ APPROACH_LENGTH = 0.15
 RETREATS = wp.constant(7)
 """Directions in which the hand is tried to leave, by this order."""
 
-STRETCHES = wp.constant(5)
-"""Parts of the way that are looked at side by side."""
+GPU_STRETCHES = 5
+"""Parts of the way that a GPU looks at side by side."""
 
 _COARSE_STEPS = wp.constant(15)  # of all ways
-_STEPS = wp.constant(50)  # of the one that is taken, 3 mm each
+_STEPS = wp.constant(30)  # of the one that is taken, 5 mm each
 _SURE = wp.constant(1.0e-3)  # [m] of a distance in a grid
 _PARTS = wp.constant(8)  # of the way from q_pregrasp to q
 _LEAST_SINE = wp.constant(1.0e-3)
@@ -111,8 +111,10 @@ def _body_pose(hand: Hand, b: wp.int32, q: wp.array2d(dtype=wp.float32), row: wp
 
 
 @wp.func
-def _way_blocked(hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.transform, way: wp.vec3, first: wp.int32):
-    """True if a body comes too deep into the object on a stretch, from step ``first`` on, of the way from
+def _way_blocked(
+    hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.transform, way: wp.vec3, first: wp.int32, end: wp.int32
+):
+    """True if a body comes too deep into the object at a step from ``first`` to before ``end`` of the way from
     T = T_object_body along ``way`` (object's frame)."""
     ball = hand.pieces.body_sphere[b]
     if ball[3] < 0.0:
@@ -120,7 +122,7 @@ def _way_blocked(hand: Hand, obj: Object, limits: Limits, b: wp.int32, T: wp.tra
     centre = wp.transform_point(T, wp.vec3(ball[0], ball[1], ball[2]))
     length = APPROACH_LENGTH / float(_STEPS)
     step = int(first)
-    while step < first + _STEPS // STRETCHES:
+    while step < end:
         by = way * (length * float(step + 1))
         clear = sdf_value(obj.sdf, centre + by) - ball[3] - _SURE
         if clear > 0.0:
@@ -187,6 +189,7 @@ def check_way(
     row: wp.array(dtype=wp.int32),
     packed: Packed,
     clear: wp.array(dtype=wp.int32),
+    stretches: wp.int32,
     refused_out: wp.array(dtype=wp.int32),
 ):
     """One thread per (stretch, body, row kept): is the first retreat that is clear so at every step of a stretch?
@@ -194,6 +197,7 @@ def check_way(
     Args:
         row: (m,) hand of each row, -1 none.
         clear: (m,) bit k: retreat k is clear.
+        stretches: of the way.
         refused_out: (m,) 1: it is not; of zeros.
     """
     stretch, b, i = wp.tid()
@@ -205,8 +209,8 @@ def check_way(
     way = retreat(palm, _up(obj, at, s), wp.transform_point(T, obj.com), k)
     T_object = wp.transform_inverse(T)
     B = T_object * _body_pose(hand, b, packed.q_pregrasp, i)
-    first = stretch * (_STEPS // STRETCHES)
-    if _way_blocked(hand, obj, limits, b, B, wp.transform_vector(T_object, way), first):
+    first, end = stretch * _STEPS // stretches, (stretch + 1) * _STEPS // stretches
+    if _way_blocked(hand, obj, limits, b, B, wp.transform_vector(T_object, way), first, end):
         refused_out[i] = 1
 
 

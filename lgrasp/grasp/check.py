@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from lgrasp.grasp.approach_kernels import (
+    GPU_STRETCHES,
     RETREATS,
-    STRETCHES,
     Palm,
     check_table,
     check_way,
@@ -172,7 +172,8 @@ class Check:
         clear, refused = (wp.zeros(m, dtype=wp.int32, device=d) for _ in range(2))
         inputs = [self.hand.struct, self.obj.struct, self.limits, palm, self.at, row, packed]
         wp.launch(try_retreats, (m, RETREATS), inputs, [clear], device=d)
-        wp.launch(check_way, (STRETCHES, self.bodies, m), [*inputs, clear], [refused], device=d)
+        stretches = 1 if d == "cpu" else GPU_STRETCHES
+        wp.launch(check_way, (stretches, self.bodies, m), [*inputs, clear, stretches], [refused], device=d)
         inputs = [self.hand.struct, self.obj.struct, self.limits, self.at, row, packed]
         wp.launch(close_above, (self.hand.model.groups, m), inputs, [refused], device=d)
         inputs = [self.obj.struct, palm, self.at, row, clear, refused]

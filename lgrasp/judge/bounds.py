@@ -17,7 +17,7 @@ RESIDUAL = 0.05
 
 RESTING_GAP = 1e-3
 """Lowest point of an object from the table that it rests on [m]."""
-APPROACH_LENGTH, APPROACH_STEP = 0.15, 0.005
+APPROACH_LENGTH, APPROACH_STEP = 0.15, 0.004
 """Way of the open hand to the grasp of an object on a table, and between the places where it is judged [m]."""
 CLOSING = (0.2, 0.35, 0.5, 0.65, 0.8)
 """Parts of the way from ``q_pregrasp`` to ``q`` at which the hand is above the table, too."""
