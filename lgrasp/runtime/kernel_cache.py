@@ -110,7 +110,7 @@ def remove_unfinished(folder: Path) -> None:
 
 
 def remove_modules(folder: Path, before: float | None = None) -> int:
-    """Remove compiled modules of a folder and of those below it, not what is being compiled.
+    """Remove the compiled modules below a folder, not what is being compiled, nor marks of living processes.
 
     Args:
         before: only those compiled before a time [s since 1970].
@@ -119,13 +119,12 @@ def remove_modules(folder: Path, before: float | None = None) -> int:
         Their size [bytes].
     """
     size = 0
-    for inner in (folder, *(path for path in folder.rglob("*") if path.is_dir() and _modules(path))):
-        for module in _modules(inner):
-            with suppress(OSError):
-                files = [path.stat() for path in module.iterdir() if path.is_file()]
-                if files and (before is None or max(info.st_mtime for info in files) < before):
-                    size += sum(info.st_size for info in files)
-                    _drop(module)
+    for module in [path for path in folder.rglob("wp_*") if path.is_dir() and not _UNFINISHED.search(path.name)]:
+        with suppress(OSError):
+            files = [path.stat() for path in module.iterdir()]
+            if before is None or max((info.st_mtime for info in files), default=0.0) < before:
+                size += sum(info.st_size for info in files)
+                _drop(module)
     return size
 
 
