@@ -91,6 +91,12 @@ def _up(obj: Object, at: CheckedPostures, s: wp.int32):
 
 
 @wp.func
+def _way_off(palm: Palm, obj: Object, at: CheckedPostures, s: wp.int32, k: wp.int32):
+    """:func:`retreat` k of hand s, base frame."""
+    return retreat(palm, _up(obj, at, s), wp.transform_point(at.pose[at.of[s]], obj.com), k)
+
+
+@wp.func
 def first_clear(clear: wp.array(dtype=wp.int32), i: wp.int32):
     """The first retreat of row i that is clear, -1 none."""
     for k in range(RETREATS):
@@ -159,9 +165,8 @@ def try_retreats(
     if s < 0 or clear_out[i] & ((1 << k) - 1) != 0:
         return
     T = at.pose[at.of[s]]
-    up = _up(obj, at, s)
-    way = retreat(palm, up, wp.transform_point(T, obj.com), k)
-    if wp.dot(way, up) < 0.0:
+    way = _way_off(palm, obj, at, s, k)
+    if wp.dot(way, _up(obj, at, s)) < 0.0:
         return
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     for g in range(hand.kin.groups):
@@ -206,7 +211,7 @@ def check_way(
     if s < 0 or k < 0 or refused_out[i] == 1:
         return
     T = at.pose[at.of[s]]
-    way = retreat(palm, _up(obj, at, s), wp.transform_point(T, obj.com), k)
+    way = _way_off(palm, obj, at, s, k)
     T_object = wp.transform_inverse(T)
     B = T_object * _body_pose(hand, b, packed.q_pregrasp, i)
     first, end = stretch * _STEPS // stretches, (stretch + 1) * _STEPS // stretches
@@ -273,7 +278,7 @@ def choose_approach(
     packed_out.approach[i] = wp.vec3(wp.nan, wp.nan, wp.nan)
     k = first_clear(clear, i)
     if k >= 0 and refused[i] == 0:
-        packed_out.approach[i] = -retreat(palm, _up(obj, at, s), wp.transform_point(at.pose[at.of[s]], obj.com), k)
+        packed_out.approach[i] = -_way_off(palm, obj, at, s, k)
         return
     wp.atomic_sub(counts_out, Outcome.KEPT, 1)
     wp.atomic_add(counts_out, Outcome.APPROACH, 1)

@@ -47,9 +47,9 @@ def find_network(name: str) -> Path:
     return known[name]
 
 
-def check_trained(*states: "Mapping[str, torch.Tensor]") -> None:
+def check_trained(state: "Mapping[str, torch.Tensor]") -> None:
     """Raise ConfigError if weights that a training leaves, as they are stored, are not finite numbers."""
-    for name, values in (pair for state in states for pair in state.items()):
+    for name, values in state.items():
         if not values.isfinite().all():
             raise ConfigError(f"the training diverged: {name} has weights that are not finite; lower the rates (--set)")
 

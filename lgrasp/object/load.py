@@ -104,10 +104,10 @@ def load_mesh(
     faces = _orient(vertices, faces, notes)
     vertices, faces = close_holes(vertices, faces, params.hole_perimeter, notes)
     loose = len(open_edges(faces))
-    if not loose:
-        vertices, faces = _unite(vertices, faces, notes)
     if loose:
         notes.append(f"not watertight ({loose} open edges): inside is decided by winding number")
+    else:
+        vertices, faces = _unite(vertices, faces, notes)
     return LoadedMesh(name, sha, vertices, faces.astype(np.int32), loose == 0, tuple(notes))
 
 

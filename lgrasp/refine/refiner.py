@@ -66,6 +66,11 @@ def clipped(g: Gradient, p: LocalSearch) -> Gradient:
     )
 
 
+def _lost(*hands: torch.Tensor) -> torch.Tensor:
+    """NaN of hands (N, ...) that are not finite, 0 of others, (N,)."""
+    return torch.cat([x.flatten(1) for x in hands], 1).sum(1) * 0
+
+
 class Refiner(nn.Module):
     """Moves hands by the gradient of E* (:mod:`lgrasp.refine.energy`) until their surface fits the object's.
 
@@ -142,7 +147,7 @@ class Refiner(nn.Module):
             parts = zip(*(x.chunk(workers) for x in given), strict=True)
             with ThreadPoolExecutor(workers) as pool:
                 found = list(pool.map(search, [Pose(*part) for part in parts]))
-            lost = torch.cat([x.flatten(1) for x in given], 1).sum(1) * 0  # NaN of hands that have one
+            lost = _lost(*given)
             pose = Pose(*(torch.cat(x) + lost.reshape(-1, *(1,) * (x[0].ndim - 1)) for x in zip(*found, strict=True)))
             return Refined(pose, self.energy(*pose))
 
@@ -151,9 +156,8 @@ class Refiner(nn.Module):
         that are not finite."""
         self._check(R, t, q)
         with torch.no_grad():
-            lost = torch.cat([x.flatten(1) for x in (R, t, q)], 1).sum(1) * 0  # NaN of hands that have one
             depth = torch.as_tensor(self.search.max_penetration(self._put(Pose(R, t, q))), device=self._device)
-            return depth + lost.to(depth)
+            return depth + _lost(R, t, q).to(depth)
 
     @property
     def search(self) -> Descent:

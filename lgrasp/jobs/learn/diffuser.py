@@ -13,13 +13,13 @@ from lgrasp.jobs.learn.network import NetworkJob, training_report
 from lgrasp.jobs.learn.sequences import read_steps
 from lgrasp.jobs.requests.shards import DiffuserRequest
 from lgrasp.jobs.scenes.shards import check_hand
-from lgrasp.learn.diffuser.examples import StepExamples, make_net, split_steps, unseen_objects
-from lgrasp.learn.diffuser.file import KIND, VERSION, AboutDiffuser, diffuser_bytes, load_diffuser, stored_state
+from lgrasp.learn.diffuser.examples import StepExamples, make_net
+from lgrasp.learn.diffuser.file import KIND, VERSION, AboutDiffuser, diffuser_bytes, load_diffuser
 from lgrasp.learn.diffuser.process import PROCESSES
 from lgrasp.learn.diffuser.sampler import draw_steps
 from lgrasp.learn.diffuser.senses import HeldObjects, Senses, sense_points
 from lgrasp.learn.diffuser.training import StepTrainer, mean_loss
-from lgrasp.learn.networks import SHARDS, check_network_hand, check_trained
+from lgrasp.learn.networks import SHARDS, check_network_hand
 from lgrasp.runtime.device import resolve_device
 
 _MIN_STEPS = 64  # of sequences, to learn from
@@ -35,9 +35,7 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
         p, start = self.params, time.perf_counter()
         found = read_steps(self.shards, self.cache, self.device_used, p.cloud)
         check_hand(found.hand, self.hand, "the sequences")
-        unseen = unseen_objects(found.meshes, p.held_out, p.seed)
-        learnt = len(split_steps(found.steps.object, found.steps.held, unseen)[0])
-        self.enough(learnt, "steps", _MIN_STEPS, len(found.steps.t) - learnt)
+        unseen = self.hold_out(found.meshes, found.steps, "steps", _MIN_STEPS)
         hand, net = found.hand, make_net(found.hand, len(found.space_names), p)
         examples = StepExamples(hand.tree, found.steps, found.clouds, found.grids, net, p, self.device_used.alias)
         trainer = StepTrainer(net, examples, unseen, p, self.device_used.alias)
@@ -46,7 +44,6 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
         seconds = {"reading": read, "training": time.perf_counter() - start - read}
         report = training_report(hand.name, trainer, found.object_names, unseen, seconds, {"drawing": curve})
         about = AboutDiffuser(hand.name, hand.sha256, found.space_names, p, self.key(), report)
-        check_trained(stored_state(trainer.kept))
         return Made(part.rows, diffuser_bytes(trainer.kept, about))
 
 

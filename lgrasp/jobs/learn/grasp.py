@@ -35,9 +35,8 @@ from lgrasp.jobs.requests.shards import GraspRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard, palmar_side
 from lgrasp.learn.curve import LossCurve
-from lgrasp.learn.diffuser.examples import SequenceSteps, make_net, split_steps, unseen_objects
+from lgrasp.learn.diffuser.examples import SequenceSteps, make_net
 from lgrasp.learn.diffuser.features import mesh_centre
-from lgrasp.learn.diffuser.file import stored_state
 from lgrasp.learn.diffuser.senses import coarse_grid
 from lgrasp.learn.diffuser.training import StepTrainer
 from lgrasp.learn.examples import seen_cloud
@@ -47,7 +46,7 @@ from lgrasp.learn.grasp.examples import first_steps, grasp_examples
 from lgrasp.learn.grasp.file import KIND, VERSION, Networks, load_networks, predictor_bytes
 from lgrasp.learn.grasp.solids import random_solids
 from lgrasp.learn.grasp.views import SIDES, camera, draw_views
-from lgrasp.learn.networks import SHARDS, check_network_hand, check_trained
+from lgrasp.learn.networks import SHARDS, check_network_hand
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.planning.params import PlanParams, cloud_params
@@ -68,9 +67,7 @@ class GraspJob(GraspRequest, NetworkJob):
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, alias, start = self.params, self.device_used.alias, time.perf_counter()
         hand, records, steps, views = self._examples()
-        unseen = unseen_objects([record.sha256 for record in records], p.held_out, p.seed)
-        learnt = len(split_steps(steps.object, steps.held, unseen)[0])
-        self.enough(learnt, "grasps", _LEAST, len(steps.t) - learnt)
+        unseen = self.hold_out([record.sha256 for record in records], steps, "grasps", _LEAST)
         seconds = {"reading": time.perf_counter() - start}
         state = torch.random.get_rng_state()
         torch.manual_seed(p.seed)
@@ -92,7 +89,6 @@ class GraspJob(GraspRequest, NetworkJob):
         names, curves = [r.name for r in records], {"completion": {"loss": completion.points}, "drawing": curve}
         report = training_report(hand.name, trainer, names, unseen, seconds, curves) | {"completion_loss": error}
         made = Networks(trainer.kept, completes, p, hand.name, hand.sha256, self.key(), report)
-        check_trained(stored_state(trainer.kept), stored_state(completes))
         return Made(part.rows, predictor_bytes(made))
 
     def _examples(self) -> tuple[HandModel, list[ObjectRecord], SequenceSteps, ViewSet]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # torch takes a second to import
     import torch
 
     from lgrasp.learn.curve import Curves
+    from lgrasp.learn.diffuser.examples import SequenceSteps
     from lgrasp.learn.diffuser.training import StepTrainer
 
 
@@ -67,6 +68,22 @@ class NetworkJob(FitRequest, FileJob):
             shards = ", ".join(map(str, self.shards))
             others = f" besides the {held_out} that have to do with what is held out (held_out)" if held_out else ""
             raise ConfigError(f"{shards}: {count} {what}{others}; at least {least} are needed to learn from")
+
+    def hold_out(self, meshes: Sequence[str], steps: "SequenceSteps", what: str, least: int) -> "torch.Tensor":
+        """Which objects are held out, (O,) bool.
+
+        Args:
+            meshes: hash of each object.
+
+        Raises:
+            ConfigError: too few steps are left to learn from.
+        """
+        from lgrasp.learn.diffuser.examples import split_steps, unseen_objects
+
+        unseen = unseen_objects(meshes, self.params.held_out, self.params.seed)
+        learnt = len(split_steps(steps.object, steps.held, unseen)[0])
+        self.enough(learnt, what, least, len(steps.t) - learnt)
+        return unseen
 
     def found(self, part: Part) -> Found:
         with open_network(part.file, *self.kind) as (card, _):

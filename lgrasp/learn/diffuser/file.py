@@ -7,7 +7,7 @@ import torch
 
 from lgrasp.learn.diffuser.network import DiffuserNet
 from lgrasp.learn.diffuser.params import DiffuserParams
-from lgrasp.learn.networks import network_bytes, open_network
+from lgrasp.learn.networks import check_trained, network_bytes, open_network
 
 KIND, VERSION = "diffuser", 2
 
@@ -31,9 +31,15 @@ def diffuser_bytes(net: DiffuserNet, about: AboutDiffuser) -> bytes:
 
 
 def stored_state(net: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """Weights in half precision, numbers with a unit in single, on the CPU."""
+    """Weights in half precision, numbers with a unit in single, on the CPU.
+
+    Raises:
+        ConfigError: they are not finite numbers.
+    """
     buffers = {name for name, _ in net.named_buffers()}
-    return {name: x.cpu().float() if name in buffers else x.cpu().half() for name, x in net.state_dict().items()}
+    state = {name: x.cpu().float() if name in buffers else x.cpu().half() for name, x in net.state_dict().items()}
+    check_trained(state)
+    return state
 
 
 def load_diffuser(path: Path) -> tuple[DiffuserNet, AboutDiffuser]:
