@@ -5,6 +5,17 @@ import json
 from pathlib import Path
 from urllib.parse import unquote
 
+_LFS_POINTER = b"version https://git-lfs"
+
+
+def check_pointer(data: bytes) -> None:
+    """
+    Raises:
+        ValueError: the bytes only name a file of Git LFS.
+    """
+    if data.startswith(_LFS_POINTER):
+        raise ValueError("a pointer of Git LFS, not the mesh itself; git lfs pull fetches it")
+
 
 def mesh_bytes(path: Path, data: bytes | None = None) -> dict[str, bytes]:
     """All bytes that make a mesh, by name: "" for the file itself, else the URI of a buffer.

@@ -14,6 +14,8 @@ from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.edges import sample_creases
 from lgrasp.geometry.hulls import convex_hull, farthest_corners, fewer_corners
+from lgrasp.geometry.mesh_files import check_pointer
+from lgrasp.geometry.obj_file import read_obj
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.tree import Tree
@@ -65,9 +67,18 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
 
 def read_mesh(file: Path) -> trimesh.Trimesh:
     """The mesh of a file as it is without a scale: in metres where a file of COLLADA states its unit, as other tools
-    read it."""
+    read it.
+
+    Raises:
+        ValueError, or whatever a parser raises: the file cannot be read.
+    """
+    data, kind = file.read_bytes(), file.suffix.lower()[1:]
+    check_pointer(data)
+    if kind == "obj":
+        raw = read_obj(data)
+        return trimesh.Trimesh(raw.vertices, raw.faces, process=True)
     mesh = trimesh.load_mesh(file, process=True)
-    if file.suffix.lower() == ".dae" and mesh.units:
+    if kind == "dae" and mesh.units:
         mesh.apply_scale(unit_conversion(mesh.units, "meters"))
     return mesh
 

@@ -20,10 +20,10 @@ from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError, short_reason
 from lgrasp.geometry.edges import bodies, open_edges, winding_number
-from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
+from lgrasp.geometry.mesh_files import check_pointer, mesh_bytes, mesh_digest
+from lgrasp.geometry.obj_file import RawMesh, read_obj
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.mass import united_bodies
-from lgrasp.object.obj_file import read_obj
 from lgrasp.object.params import ObjectParams
 from lgrasp.paths import check_file
 
@@ -32,7 +32,6 @@ _ROUNDING = 1e-4  # of a largest side, by files of single precision
 _SAME = 1e-8  # [m] between vertices that are one
 _FARTHEST = 100.0  # [m] from the origin; a shard's numbers are 0.01 mm apart there
 _MOST_UNPACKED = 256 << 20
-_LFS_POINTER = b"version https://git-lfs"
 _UNITS = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"))
 
 
@@ -167,10 +166,12 @@ def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
         ObjectError: it cannot be read, or holds no faces.
     """
     kind = path.suffix.lower()[1:]
-    if files[""].startswith(_LFS_POINTER):
-        raise ObjectError(f"{path}: a pointer of Git LFS, not the mesh itself; git lfs pull fetches it")
+    try:
+        check_pointer(files[""])
+    except ValueError as error:
+        raise ObjectError(f"{path}: {error}") from None
     if kind == "obj":  # read by the file's own numbers, which regions go by too
-        raw = read_obj(path, files[""])
+        raw = parse_obj(path, files[""])
         return [trimesh.Trimesh(raw.vertices, raw.faces, process=False)]
     options: dict[str, Any] = {}
     if kind == "gltf":
@@ -182,11 +183,27 @@ def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
             scene = trimesh.load_scene(io.BytesIO(files[""]), file_type=kind, process=False, **options)
             meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh) and len(m.faces)]
     except Exception as error:  # the parsers raise anything on garbage
-        why = f"not a readable .{kind} mesh ({short_reason(error, 120)}); a triangle mesh file is accepted"
-        raise ObjectError(f"{path}: {why}") from error
+        raise _unreadable(path, error) from error
     if not meshes:
         raise ObjectError(f"{path}: 0 faces; a .{kind} file with a triangle mesh of a solid is accepted")
     return meshes
+
+
+def parse_obj(path: Path, data: bytes) -> RawMesh:
+    """The mesh of an OBJ file's bytes.
+
+    Raises:
+        ObjectError: they cannot be read, or hold no faces.
+    """
+    try:
+        return read_obj(data)
+    except ValueError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> ObjectError:
+    why = f"not a readable {path.suffix.lower()} mesh ({short_reason(error, 120)}); a triangle mesh file is accepted"
+    return ObjectError(f"{path}: {why}")
 
 
 def join_parts(path: Path, meshes: Sequence[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:

@@ -7,9 +7,9 @@ import numpy as np
 
 from lgrasp.errors import ObjectError
 from lgrasp.geometry.mesh_files import mesh_bytes
+from lgrasp.geometry.obj_file import RawMesh
 from lgrasp.object.find import MESH_SUFFIXES
-from lgrasp.object.load import join_parts, mesh_parts, read_bytes
-from lgrasp.object.obj_file import RawMesh, read_obj
+from lgrasp.object.load import join_parts, mesh_parts, parse_obj, read_bytes
 
 
 def read_raw(path: Path) -> RawMesh:
@@ -20,7 +20,7 @@ def read_raw(path: Path) -> RawMesh:
     """
     data = read_bytes(path, MESH_SUFFIXES, "a mesh file", ObjectError)
     if path.suffix.lower() == ".obj":
-        return read_obj(path, data)
+        return parse_obj(path, data)
     meshes = mesh_parts(path, mesh_bytes(path, data))
     vertices, faces = join_parts(path, meshes)
     painted: list[Any] = [m.visual for m in meshes]

@@ -1,6 +1,7 @@
 """Meshes of links, and points on their surface."""
 
 import numpy as np
+import pytest
 import trimesh
 from scipy.spatial import KDTree
 
@@ -29,3 +30,28 @@ def test_units_of_collada_files_count(tmp_path):
         file.write_text(text.replace("</asset>", f"{unit}</asset>"))
         for mesh in (read_mesh(file), load_mesh(file, file.name), load_mesh(file.read_bytes(), file.name)):
             np.testing.assert_allclose(mesh.extents, metres * np.array([8.0, 16.0, 24.0]), rtol=1e-6)
+
+
+def test_obj_files_of_links_are_read_as_those_of_objects(tmp_path):
+    """Two boxes, each corner with a texture of its own in each face, counted back from where a face stands."""
+    box, lines = trimesh.creation.box((0.02, 0.03, 0.04)), []
+    for x in (0.0, 0.05):
+        lines += [f"v {a + x} {b} {c}" for a, b, c in box.vertices]
+        for k, face in enumerate(box.faces):
+            lines += [f"vt {k / 12} {c / 3}" for c in range(3)]
+            lines += ["f " + " ".join(f"{corner - 8}/{c - 3}" for c, corner in enumerate(face))]
+    file = tmp_path / "link.obj"
+    file.write_text("\n".join(lines))
+    mesh = read_mesh(file)
+    assert mesh.is_watertight
+    assert mesh.body_count == 2
+    np.testing.assert_allclose([mesh.volume, mesh.extents[0]], [2 * box.volume, 0.07], rtol=1e-9)
+    np.testing.assert_allclose(load_mesh(file, file.name).bounds, mesh.bounds)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".dae"])
+def test_a_pointer_of_git_lfs_is_named(tmp_path, suffix):
+    file = tmp_path / f"link{suffix}"
+    file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12345\n")
+    with pytest.raises(ValueError, match="git lfs pull"):
+        read_mesh(file)

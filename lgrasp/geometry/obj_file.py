@@ -4,11 +4,9 @@ import codecs
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from lgrasp.errors import ObjectError
 from lgrasp.geometry.polygons import cut_polygons
 
 _COMMENT = re.compile(r"(^|\s)#.*")
@@ -32,40 +30,37 @@ class RawMesh:
     colours: np.ndarray | None
 
 
-def read_obj(path: Path, data: bytes) -> RawMesh:
-    """The mesh of an OBJ file; ``path`` is for messages.
+def read_obj(data: bytes) -> RawMesh:
+    """The mesh of an OBJ file's bytes.
 
     Raises:
-        ObjectError: it cannot be read, or holds no faces.
+        ValueError: they cannot be read, or hold no faces.
     """
     vertices: list[list[str]] = []
     corners: list[int] = []
     sizes: list[int] = []
     groups: dict[str, list[int]] = {}  # polygons
     now: dict[str, list[str]] = {}  # names in force, by what gave them
-    try:
-        for what, rest in _statements(data):
-            if what == "v":
-                vertices.append(rest.split())
-            elif what in _NAMES:
-                now[what] = rest.split() if what == "g" else [rest]
-            elif what == "f":
-                polygon = [int(corner.partition("/")[0]) for corner in rest.split()]
-                if len(polygon) < 3:  # a point or a line
-                    continue
-                corners += [i - 1 if i > 0 else len(vertices) + i for i in polygon]
-                for name in {name for names in now.values() for name in names}:
-                    groups.setdefault(name, []).append(len(sizes))
-                sizes.append(len(polygon))
-        numbers = np.array([v[:3] for v in vertices], float).reshape(-1, 3)
-        coloured = bool(vertices) and all(len(v) == 6 for v in vertices)
-        colours = np.array([v[3:] for v in vertices], float) if coloured else None
-    except ValueError as error:
-        raise ObjectError(f"{path}: not a readable .obj mesh ({error}); a triangle mesh file is accepted") from None
-    if not corners or min(corners) < 0 or max(corners) >= len(numbers):
-        raise ObjectError(
-            f"{path}: {len(sizes)} faces of {len(numbers)} vertices; faces of existing vertices are accepted"
-        )
+    for what, rest in _statements(data):
+        if what == "v":
+            vertices.append(rest.split())
+        elif what in _NAMES:
+            now[what] = rest.split() if what == "g" else [rest]
+        elif what == "f":
+            polygon = [int(corner.partition("/")[0]) for corner in rest.split()]
+            if len(polygon) < 3:  # a point or a line
+                continue
+            corners += [i - 1 if i > 0 else len(vertices) + i for i in polygon]
+            for name in {name for names in now.values() for name in names}:
+                groups.setdefault(name, []).append(len(sizes))
+            sizes.append(len(polygon))
+    numbers = np.array([v[:3] for v in vertices], float).reshape(-1, 3)
+    coloured = bool(vertices) and all(len(v) == 6 for v in vertices)
+    colours = np.array([v[3:] for v in vertices], float) if coloured else None
+    if not corners:
+        raise ValueError("0 faces")
+    if min(corners) < 0 or max(corners) >= len(numbers):
+        raise ValueError(f"a face names vertex {max(corners) + 1} of {len(numbers)}")
     faces, of = cut_polygons(numbers, np.array(corners), np.array(sizes))
     first = np.searchsorted(of, np.arange(len(sizes) + 1))
     named = {
