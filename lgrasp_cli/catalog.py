@@ -44,6 +44,8 @@ def show_object(mesh: MeshArgument, scale: Scale = 1.0) -> Answer:
         ("file", data["file"]),
         ("faces", f"{data['faces']:,}"),
         ("size", " x ".join(f"{1000 * side:.1f}" for side in data["extents"]) + " mm"),
+        ("volume", f"{1e6 * data['volume']:,.1f} cm³" + ("" if data["solid"] else " (of the convex hull)")),
+        ("centre of mass", ", ".join(f"{1000 * x:.1f}" for x in data["center_of_mass"]) + " mm"),
         ("watertight", "yes" if data["watertight"] else "no"),
         ("sha256", data["sha256"]),
         *(("repaired", note) for note in data["notes"]),

@@ -6,15 +6,23 @@ from pathlib import Path
 from urllib.parse import unquote
 
 _LFS_POINTER = b"version https://git-lfs"
+_STL_TEXT = 1000  # bytes in which the first face of a text begins
 
 
-def check_pointer(data: bytes) -> None:
-    """
+def check_whole(kind: str, data: bytes) -> None:
+    """Refuse bytes that a parser would take for an empty mesh.
+
     Raises:
-        ValueError: the bytes only name a file of Git LFS.
+        ValueError: they only name a file of Git LFS, or are not all of a binary STL, or more.
     """
     if data.startswith(_LFS_POINTER):
         raise ValueError("a pointer of Git LFS, not the mesh itself; git lfs pull fetches it")
+    if kind == "stl" and b"facet" not in data[:_STL_TEXT]:
+        faces = int.from_bytes(data[80:84], "little")
+        if len(data) != 84 + 50 * faces:
+            raise ValueError(
+                f"{len(data):,} bytes for the {faces:,} faces of a binary STL; {84 + 50 * faces:,} are accepted"
+            )
 
 
 def mesh_bytes(path: Path, data: bytes | None = None) -> dict[str, bytes]:

@@ -14,7 +14,7 @@ from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.geometry.edges import sample_creases
 from lgrasp.geometry.hulls import convex_hull, farthest_corners, fewer_corners
-from lgrasp.geometry.mesh_files import check_pointer
+from lgrasp.geometry.mesh_files import check_whole
 from lgrasp.geometry.obj_file import read_obj
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.piece import Piece
@@ -73,7 +73,7 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
         ValueError, or whatever a parser raises: the file cannot be read.
     """
     data, kind = file.read_bytes(), file.suffix.lower()[1:]
-    check_pointer(data)
+    check_whole(kind, data)
     if kind == "obj":
         raw = read_obj(data)
         return trimesh.Trimesh(raw.vertices, raw.faces, process=True)

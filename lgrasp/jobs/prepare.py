@@ -13,6 +13,7 @@ from lgrasp.hand.arrays import upload_hand
 from lgrasp.jobs.hands import hand_source
 from lgrasp.object.find import find_object
 from lgrasp.object.load import load_mesh
+from lgrasp.object.mass import mass_properties
 from lgrasp.object.params import ObjectParams
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.device import start as start_warp
@@ -86,18 +87,22 @@ def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: floa
 
 
 def describe_object(mesh: str, scale: float) -> dict[str, Any]:
-    """A mesh as it would be used: size, repairs.
+    """A mesh as it would be used: size, volume [m³], centre of mass [m], repairs.
 
     Raises:
         ObjectError: the mesh cannot be used.
     """
     path = find_object(mesh)
     loaded = load_mesh(path, scale=scale)
+    body = mass_properties(loaded.vertices, loaded.faces)
     return {
         "name": loaded.name,
         "file": str(path),
         "faces": len(loaded.faces),
         "extents": [float(side) for side in np.ptp(loaded.vertices, axis=0)],
+        "volume": body.volume,
+        "center_of_mass": [float(x) for x in body.center],
+        "solid": body.solid,
         "watertight": loaded.closed,
         "sha256": loaded.sha256,
         "notes": list(loaded.notes),

@@ -20,7 +20,7 @@ from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError, short_reason
 from lgrasp.geometry.edges import bodies, open_edges, winding_number
-from lgrasp.geometry.mesh_files import check_pointer, mesh_bytes, mesh_digest
+from lgrasp.geometry.mesh_files import check_whole, mesh_bytes, mesh_digest
 from lgrasp.geometry.obj_file import RawMesh, read_obj
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.mass import united_bodies
@@ -32,6 +32,7 @@ _ROUNDING = 1e-4  # of a largest side, by files of single precision
 _SAME = 1e-8  # [m] between vertices that are one
 _FARTHEST = 100.0  # [m] from the origin; a shard's numbers are 0.01 mm apart there
 _MOST_UNPACKED = 256 << 20
+_ONE_SIZE = (".ply", ".off")  # whose parsers want faces of as many corners each
 _UNITS = ((0.001, "millimetres"), (0.01, "centimetres"), (0.0254, "inches"))
 
 
@@ -167,7 +168,7 @@ def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
     """
     kind = path.suffix.lower()[1:]
     try:
-        check_pointer(files[""])
+        check_whole(kind, files[""])
     except ValueError as error:
         raise ObjectError(f"{path}: {error}") from None
     if kind == "obj":  # read by the file's own numbers, which regions go by too
@@ -202,8 +203,9 @@ def parse_obj(path: Path, data: bytes) -> RawMesh:
 
 
 def _unreadable(path: Path, error: Exception) -> ObjectError:
-    why = f"not a readable {path.suffix.lower()} mesh ({short_reason(error, 120)}); a triangle mesh file is accepted"
-    return ObjectError(f"{path}: {why}")
+    kind = path.suffix.lower()
+    accepted = "triangles, in .obj any polygons, are" if kind in _ONE_SIZE else "a triangle mesh file is"
+    return ObjectError(f"{path}: not a readable {kind} mesh ({short_reason(error, 120)}); {accepted} accepted")
 
 
 def join_parts(path: Path, meshes: Sequence[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:

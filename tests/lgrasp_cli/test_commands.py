@@ -4,7 +4,9 @@ import json
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from support.shards import sample_shard
 
 from lgrasp.dataset.writer import write_shard
@@ -81,7 +83,11 @@ def test_hands(cli):
 def test_objects(cli):
     assert {"mug", "tiny"} <= {entry["name"] for entry in json.loads(cli("objects", "list", "--json", "-").out)}
     assert "mug" in cli("objects", "list").out
-    assert "watertight  yes" in cli("objects", "show", "tiny").out
+    shown = json.loads(cli("objects", "show", "tiny", "--json", "-").out)
+    mesh = trimesh.load_mesh(shown["file"])
+    assert shown["volume"] == pytest.approx(mesh.volume)
+    np.testing.assert_allclose(shown["center_of_mass"], mesh.center_mass, atol=1e-6)
+    assert f"{1e6 * mesh.volume:,.1f} cm³" in cli("objects", "show", "tiny").out
     assert "did you mean" in cli("objects", "show", "tinny").error()
 
 

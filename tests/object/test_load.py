@@ -90,6 +90,14 @@ def test_face_names_a_missing_vertex(tmp_path):
     assert str(path) in refused(path)
 
 
+@pytest.mark.parametrize("change", [b"\0" * 10, -10])
+def test_stl_of_another_length(tmp_path, change):
+    data = _bytes(BOX, tmp_path / "box.stl")
+    path = tmp_path / "box.stl"
+    path.write_bytes(data[:change] if isinstance(change, int) else data + change)
+    assert "684 are accepted" in refused(path)
+
+
 @pytest.mark.parametrize("value", ["nan", "inf"])
 def test_not_finite(tmp_path, value):
     text = _bytes(BOX, tmp_path / "box.obj").decode().replace("v ", f"v {value} ", 1)
