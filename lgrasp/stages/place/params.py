@@ -29,8 +29,12 @@ class PlaceParams(Params):
         default=0.6, ge=0, description="Weight of two opposite surface points between two opposed fingers, any roll."
     )
     palm: float = Field(default=0.1, ge=0, le=1e6, description="Weight of surface point pressed on the palm, any roll.")
-    proposals: int = Field(
-        default=8, ge=1, le=256, description="Poses tried per candidate; the one with the richest contacts stays."
+    proposals: int | None = Field(
+        default=None,
+        ge=1,
+        le=256,
+        description="Poses tried per candidate; the one with the richest contacts stays; null: 8, above a table or "
+        "plane, which blocks most, 24.",
     )
     samples: int = Field(
         default=24,

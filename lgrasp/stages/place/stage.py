@@ -28,6 +28,7 @@ VERSION = 11
 _FAVOURED_DRAWS = 128  # poses for each point of the palm
 _FAVOURED_SEED = 1  # of these: the same in all shards
 _FAVOURED_ENTRIES = 4096  # of the list that points are drawn from
+_PROPOSALS, _PROPOSALS_ABOVE = 8, 24  # for each candidate, and above a table or plane, which blocks most
 _EVERYWHERE = 0.6  # of the mean chance, added to that of each point
 
 
@@ -54,7 +55,10 @@ def run(inputs: tuple[int | wp.array, int], params: PlaceParams, context: Contex
     if not isinstance(first, wp.array):
         first = wp.full(1, first, dtype=wp.int32, device=d)
     hand, field, obj = context.hand.struct, context.field.struct, context.object.struct
-    tried = (params.policy_proposals or context.networks.proposals) if rated else params.proposals
+    if rated:
+        tried = params.policy_proposals or context.networks.proposals
+    else:
+        tried = params.proposals or (_PROPOSALS if context.object.planes is None else _PROPOSALS_ABOVE)
     groups, shape = context.hand.model.groups, (count, tried)
     proposals = empty_struct(ProposedPoses, d, *shape, groups)
     regions = context.object.steered
