@@ -10,7 +10,7 @@ from lgrasp.math.limits import MAX_JOINTS
 from lgrasp.math.sdf import sdf_below, sdf_gradient, sdf_of, sdf_value
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
-from lgrasp.stages.adjust.structs import Adjusted, AdjustValues, Deepest
+from lgrasp.stages.adjust.structs import Adjusted, AdjustValues, Deepest, Progress
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -72,27 +72,16 @@ def _deepest_obstacle(
 
 @wp.kernel
 def find_depths(
-    hand: Hand,
-    obj: Object,
-    params: AdjustValues,
-    candidates: Candidates,
-    it: wp.int32,
-    parts: wp.int32,
-    sets_out: Adjusted,
+    hand: Hand, obj: Object, params: AdjustValues, candidates: Candidates, parts: wp.int32, sets_out: Adjusted
 ):
-    """One thread per (set on its way, body, slice): where a body and the object meet deepest, of what is deeper than is
-    left.
+    """One thread per (set, body, slice): where a body and the object meet deepest, of what is deeper than is left.
 
     Args:
-        it: steps before.
         parts: slices of the points of a body.
     """
-    nth, body, part = wp.tid()
-    if nth >= sets_out.rows[it]:
-        return
-    i = sets_out.going[it % 2, nth]
+    i, body, part = wp.tid()
     g = hand.body_group[body]
-    if g >= 0 and candidates.count[i, wp.max(g, 0)] == 0:
+    if sets_out.progress[i] != int(Progress.GOING) or (g >= 0 and candidates.count[i, wp.max(g, 0)] == 0):
         return
     T = wp.transform_inverse(candidates.poses.pose[i])
     if g >= 0:

@@ -25,7 +25,7 @@ from lgrasp.stages.adjust.motion import (
     turn_row,
     vec6,
 )
-from lgrasp.stages.adjust.structs import AdjustCount, Adjusted, AdjustValues, FaceContact
+from lgrasp.stages.adjust.structs import AdjustCount, Adjusted, AdjustValues, FaceContact, Progress
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -112,10 +112,7 @@ def begin_sets(field: Field, hand: Hand, sets: Sets, candidates: Candidates, mov
     i = wp.tid()
     row = sets.pose[i]
     groups = sets.chosen.shape[1]
-    sets_out.going[0, i] = i
-    if i == 0:
-        sets_out.rows[0] = sets.pose.shape[0]
-    sets_out.whole[i] = 0
+    sets_out.progress[i] = int(Progress.GOING)
     sets_out.both[i] = 0
     for g in range(groups):
         m = sets.chosen[i, g]
@@ -187,7 +184,7 @@ def _stepping(size: int) -> Any:
         moved_out: Candidates,
         sets_out: Adjusted,
     ):
-        """One thread per set on its way: the object's pose and the joints after a step, unless every contact is made.
+        """One thread per set: the object's pose and the joints after a step, unless every contact is made.
 
         Steps (v, w, dq) := argmin sum_c (n_c . d_c + g_c + indentation)^2 + s |d_c - o_c|^2 + (lever w_n)^2 |m_c -
         m'_c|^2 + w_d sum_b (penetration of body b)^2 + damping, where d_c is how the object's point moves against the
@@ -199,10 +196,9 @@ def _stepping(size: int) -> Any:
             it: steps before this one.
             moved_out: a pose and one candidate per group for each set, S rows.
         """
-        nth = wp.tid()
-        if nth >= sets_out.rows[it]:
+        i = wp.tid()
+        if sets_out.progress[i] != int(Progress.GOING):
             return
-        i = sets_out.going[it % 2, nth]
         groups = moved_out.count.shape[1]
         T = moved_out.poses.pose[i]
         palm = moved_out.poses.palm_point[i]
@@ -302,12 +298,12 @@ def _stepping(size: int) -> Any:
                 row = -motion_row(wp.transform_vector(T, deep.away), wp.transform_point(T, deep.at) - centre)
                 add_distance(equations, row, aimed, params.depth_weight)
         if met and sets_out.both[i] == 1 and deepest <= params.max_penetration:
-            sets_out.whole[i] = 1
+            sets_out.progress[i] = int(Progress.WHOLE)
             return
         given_up = it >= params.patience and (not near or deepest > _NEAR_DEPTH)
         if given_up or it == params.iterations:
+            sets_out.progress[i] = int(Progress.GIVEN_UP)
             return
-        sets_out.going[(it + 1) % 2, wp.atomic_add(sets_out.rows, it + 1, 1)] = i
         if met or it + 1 >= _FIRST_BOTH:
             sets_out.both[i] = 1
         motion = solve_motion(equations, params.object_damping, params.lever)
@@ -337,7 +333,7 @@ def check_thumbs(hand: Hand, moved: Candidates, sets: Adjusted, whole_out: wp.ar
         whole_out: 1 or 0, (S,).
     """
     i = wp.tid()
-    whole = sets.whole[i] == 1
+    whole = sets.progress[i] == int(Progress.WHOLE)
     X = wp.zeros(shape=(MAX_JOINTS,), dtype=wp.transform)
     for g in range(moved.count.shape[1]):
         if whole and moved.count[i, g] == 1:

@@ -40,15 +40,13 @@ def run(inputs: ContactSets, params: AdjustParams, context: Context) -> tuple[Co
     parts, bodies = depth_slices(d), len(context.hand.model.piece_first) - 1
     given = {"touch": wp.empty((n, groups + 1), dtype=FaceContact, device=d)}
     given["deepest"] = wp.empty((n, bodies, parts), dtype=Deepest, device=d)
-    given["going"] = wp.empty((2, n), dtype=wp.int32, device=d)
-    given["rows"] = wp.zeros(params.iterations + 1, dtype=wp.int32, device=d)
     moving = empty_struct(Adjusted, d, n, **given)
     wp.launch(begin_sets, n, [field, hand, inputs.struct, inputs.candidates.struct], [table.struct, moving], device=d)
     step = step_sets[context.hand.model.tree.dof_size]
     for it in range(params.iterations + 1 if n else 0):
         if it >= int(FIRST_DEPTH):
             shape = (n, bodies, parts)
-            wp.launch(find_depths, shape, [hand, obj, values, table.struct, it, parts], [moving], device=d)
+            wp.launch(find_depths, shape, [hand, obj, values, table.struct, parts], [moving], device=d)
         wp.launch(step, n, [hand, field, obj, values, it], [table.struct, moving], device=d)
     upto = wp.empty(n, dtype=wp.int32, device=d)
     wp.launch(check_thumbs, n, [hand, table.struct, moving], [upto], device=d)

@@ -8,6 +8,14 @@ from lgrasp.runtime.structs import params_struct
 from lgrasp.stages.adjust.params import AdjustParams
 
 
+class Progress(IntEnum):
+    """What has become of a set."""
+
+    GOING = 0
+    WHOLE = 1  # every contact is made, nothing sinks in
+    GIVEN_UP = -1
+
+
 class AdjustCount(IntEnum):
     """Counts of the stage."""
 
@@ -40,11 +48,9 @@ class FaceContact:
 
 @wp.struct
 class Adjusted:
-    """S sets, those on their way listed before each of I steps; B bodies, the base first, each in K slices."""
+    """S sets on their way; B bodies, the base first, each looked at in K slices."""
 
-    going: wp.array2d(dtype=wp.int32)  # (2, S) sets on their way, before even and odd steps
-    rows: wp.array(dtype=wp.int32)  # (I + 1,) how many of them there are before each step
-    whole: wp.array(dtype=wp.int32)  # (S,) 1: every contact is made, nothing sinks in
+    progress: wp.array(dtype=wp.int32)  # (S,) Progress
     both: wp.array(dtype=wp.int32)  # (S,) 1: penetration is looked at both ways
     touch: wp.array2d(dtype=FaceContact)  # (S, G + 1) contact of each group, the palm's last
     deepest: wp.array3d(dtype=Deepest)  # (S, B, K) of bodies whose fingers touch, and of the base
