@@ -71,7 +71,7 @@ def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
     return Path(env).expanduser() if env else Path(platformdirs.user_cache_dir("lgrasp"))
 
 
-def check_file(path: Path, suffixes: Sequence[str], what: str, error: type[LgraspError]) -> None:
+def check_input(path: Path, suffixes: Sequence[str], what: str, error: type[LgraspError]) -> None:
     """Check that an input file is there and has an accepted suffix.
 
     Args:

@@ -1,7 +1,7 @@
 """Names that options take: the shell completes them, and a wrong one is told before anything heavy is imported."""
 
 from collections.abc import Callable, Iterable
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any, get_args
 
 import typer
@@ -25,7 +25,7 @@ def named(
         if not isinstance(read, str):
             return read(name, flag)
         if read:
-            _function(read)(name)
+            resolve_name(read)(name)
         return name
 
     def callback(context: typer.Context, param: typer.CallbackParam, value: Any) -> Any:
@@ -35,16 +35,10 @@ def named(
         return [one(name, flag) for name in value] if isinstance(value, list | tuple) else one(value, flag)
 
     def complete(incomplete: str) -> list[str]:
-        names = _function(known)() if isinstance(known, str) else known()
+        names = resolve_name(known)() if isinstance(known, str) else known()
         return [name for name in names if name.startswith(incomplete)]
 
     return {"metavar": metavar, "callback": callback, "autocompletion": complete}
-
-
-def _function(place: str) -> Callable[..., Any]:
-    """What ``module:function`` stands for; the module is imported now."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
 
 
 def one_of(choice: Any, kind: str, what: str) -> dict[str, Any]:
@@ -100,6 +94,6 @@ DEVICE = named("[auto|cpu|cuda:N]", lambda: ("auto", "cpu", "cuda:0"), _device)
 DEVICES = named("[auto|cpu|cuda:N|all]", lambda: ("auto", "cpu", "cuda:0", "all"), _devices)
 HAND_OR_SHARD = HANDS = named("HAND", _hands)
 OBJECT_OR_SHARD = OBJECTS = named("OBJECT", _OBJECTS)
-HAND_OR_OBJECT = named("WHAT", lambda: (*_hands(), *_function(_OBJECTS)()))
+HAND_OR_OBJECT = named("WHAT", lambda: (*_hands(), *resolve_name(_OBJECTS)()))
 PIPELINE = named("PIPELINE", "lgrasp.engine.pipeline:pipeline_files")
 CONFIG = named("CONFIG", "lgrasp.jobs.config:config_files")

@@ -101,18 +101,21 @@ def input_keys(
     Raises:
         HandError, ObjectError: see :func:`hand_digest`, :func:`object_key`.
     """
-    digest = hand_digest(source.urdf, source.spec)
-    hand_key = hand_model_key(digest, hands)
-    thumb = {"thumb": hands.thumb.model_dump(mode="json")} if hands.thumb else {}
-    field_key = content_key("field", FIELD_VERSION, hand=hand_key, params=fields.model_dump(mode="json"), **thumb)
+    hand = hand_model_key(hand_digest(source.urdf, source.spec), hands)
     path, key = (None, "") if mesh is None else object_key(mesh, scale, objects)
-    return InputKeys(source, path, hand_key, key, field_key, hands)
+    return InputKeys(source, path, hand, key, field_key(hand, fields, hands), hands)
 
 
 def hand_model_key(digest: str, hands: HandParams = LISTED) -> str:
     """Content key of the model of a hand, given the :func:`hand_digest` of it; the same wherever its thumb is."""
     surface = hands.model_copy(update={"thumb": None})
     return content_key("hand", HAND_VERSION, content=digest, **surface.describe())
+
+
+def field_key(hand: str, params: FieldParams, hands: HandParams = LISTED) -> str:
+    """Content key of the contact field of a hand, given the key of its model."""
+    thumb = {"thumb": hands.thumb.model_dump(mode="json")} if hands.thumb else {}
+    return content_key("field", FIELD_VERSION, hand=hand, params=params.model_dump(mode="json"), **thumb)
 
 
 def object_key(mesh: str, scale: float, params: ObjectParams) -> tuple[Path, str]:

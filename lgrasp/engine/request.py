@@ -1,7 +1,7 @@
 """What is asked of a job, without what does it: light to import, so that what cannot be is told at once."""
 
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import ConfigDict, Field
@@ -53,7 +53,7 @@ class Request(Params):
 
     def job(self, cache: "Cache") -> Any:
         """The job, whose module is imported now."""
-        return named(self.maker)(**self.values(), cache=cache)
+        return resolve_name(self.maker)(**self.values(), cache=cache)
 
     def values(self) -> dict[str, Any]:
         """Every field with its value."""
@@ -90,9 +90,3 @@ class ShardRequest(Request):
         if self.in_place or not self.folder.is_dir():
             return None
         return self.folder if any(path.resolve() in self.folder.resolve().parents for path in self.shards) else None
-
-
-def named(place: str) -> Any:
-    """What ``module:name`` stands for; the module is imported now."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)

@@ -56,10 +56,6 @@ class Job(Request, ABC):
     _growing: set[int] = PrivateAttr(default_factory=set)  # numbers of parts that are there with fewer rows
 
     @property
-    def title(self) -> str:
-        return str(self.folder)
-
-    @property
     def folder(self) -> Path:
         """Where the files go."""
         return self.values()["out"]

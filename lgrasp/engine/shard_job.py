@@ -21,9 +21,9 @@ from lgrasp.engine.run import Job
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.files import locked, remove_leftovers
 from lgrasp.grasp.records import Shard
-from lgrasp.grasp.schema import MADE_FROM
+from lgrasp.grasp.schema import MADE_FROM, POSTURES
 
-_ROW = ("q", "q_pregrasp", "q_squeeze", "object_pose", "object_index", "candidate")
+_ROW = (*POSTURES, "object_pose", "object_index", "candidate")
 _BATCH_ROWS = 65_536  # at a time
 
 

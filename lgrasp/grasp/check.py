@@ -44,6 +44,7 @@ from lgrasp.grasp.pregrasp_kernels import (
     try_openings,
 )
 from lgrasp.grasp.quality_kernels import balance_grasps, center_forces, drop_light, grasp_epsilon, resist_loads
+from lgrasp.grasp.schema import POSTURES
 from lgrasp.grasp.stability_kernels import find_stable_squeeze
 from lgrasp.grasp.tables import GraspTable, take_rows
 from lgrasp.hand.arrays import HandArrays
@@ -184,7 +185,7 @@ class Check:
         d, m, model = self.hand.device, len(self), self.hand.model
         hand, obj, limits, places = self.hand.struct, self.obj.struct, self.limits, self.places
         at, found = self.at, self.found
-        postures = {n: wp.empty((m, model.dofs), dtype=wp.float32, device=d) for n in ("q", "q_pregrasp", "q_squeeze")}
+        postures = {n: wp.empty((m, model.dofs), dtype=wp.float32, device=d) for n in POSTURES}
         numbers = wp.empty((len(MEASURED), m), dtype=wp.float32, device=d)
         grown = {n: wp.zeros(m, dtype=wp.float32, device=d) for n in ("closing_penetration", "closing_sweep")}
         none = {"resting": wp.empty(0, dtype=wp.int32, device=d), "approach": wp.empty(0, dtype=wp.vec3, device=d)}

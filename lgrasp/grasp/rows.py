@@ -9,6 +9,7 @@ import numpy as np
 from lgrasp.geometry.poses import user_poses
 from lgrasp.grasp.outcomes import FAILED_BOUNDS
 from lgrasp.grasp.records import CODE, GraspRows
+from lgrasp.grasp.schema import POSTURES
 from lgrasp.grasp.tables import CONTACTS, GraspTable
 from lgrasp.hand.tree import Tree
 
@@ -27,7 +28,6 @@ METRIC_UNITS = {
 }
 """Unit of each metric that has one."""
 
-POSTURES = ("q", "q_pregrasp", "q_squeeze")
 SHARD_BITS = 40
 """Bits of the column ``candidate`` below the number of the shard."""
 _MIN_FORCE_SHARE = 1e-3  # of the normal forces together, which are 1

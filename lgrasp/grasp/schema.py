@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 FORMAT = "lgrasp-shard"
 FORMAT_VERSION = "1.2"
 CHUNK_ROWS = 4096
+POSTURES = ("q", "q_pregrasp", "q_squeeze")
 MADE_FROM = "made_from"
 """Statistic of a shard that a job made of another: content key of the job and of the rows that it was made of."""
 PASS_SHIFT = 32

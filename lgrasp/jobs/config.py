@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from pydantic import Field, model_validator
@@ -26,7 +27,7 @@ from lgrasp.config import (
 )
 from lgrasp.engine.folder import run_folder
 from lgrasp.engine.pipeline import Pipeline, load_pipeline
-from lgrasp.engine.request import Request, named
+from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.hand.names import all_hands
@@ -164,7 +165,7 @@ def load_requests(name: str, changes: dict[str, Any]) -> ConfigJobs:
     if kind == "generate" or "sequences" in data:
         return ConfigJobs(plan_requests(parse_model(JobConfig, data, f"config {path}")), devices)
     data.pop("description", None)
-    model = named(KINDS[kind])
+    model = resolve_name(KINDS[kind])
     if unfit := changes.keys() - model.model_fields.keys():
         option = f"--{min(unfit).replace('_', '-')}"
         raise ConfigError(f"config {path}: job '{kind}' has no {option}; its keys: {', '.join(model.model_fields)}")

@@ -65,8 +65,6 @@ def run_up_to(
     Raises:
         LgraspError: bad input.
     """
-    if first < 0 or count < 1 or shard < 0:
-        raise ConfigError(f"--first {first} --candidates {count} --shard-index {shard}: need 0, 1 and 0 or more")
     if last not in pipeline.order:
         raise ConfigError(f"pipeline {pipeline.name} has no stage {last}; its stages: {', '.join(pipeline.order)}")
     if pipeline.open_to_hands and last in _ELSE:

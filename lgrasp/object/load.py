@@ -25,7 +25,7 @@ from lgrasp.geometry.obj_file import RawMesh, read_obj
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.mass import united_bodies
 from lgrasp.object.params import ObjectParams
-from lgrasp.paths import check_file
+from lgrasp.paths import check_input
 
 _FLAT = 1e-4  # thinner than this share of the largest side is a plane
 _ROUNDING = 1e-4  # of a largest side, by files of single precision
@@ -118,7 +118,7 @@ def read_bytes(path: Path, suffixes: Sequence[str], what: str, error: type[Lgras
         what: what is accepted, such as ``a mesh file``.
         error: raised, in one line, for no file, an unknown suffix, a file that cannot be read or is empty.
     """
-    check_file(path, suffixes, what, error)
+    check_input(path, suffixes, what, error)
     try:
         data = path.read_bytes()
     except OSError as problem:

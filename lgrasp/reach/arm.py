@@ -12,6 +12,7 @@ from lgrasp.errors import HandError
 from lgrasp.geometry.hulls import farthest_corners
 from lgrasp.hand.digest import urdf_digest
 from lgrasp.hand.geometry import geometry_mesh
+from lgrasp.hand.links import joints_above
 from lgrasp.hand.urdf import Geometry, Joint, Urdf, check_robot, read_robot
 
 if TYPE_CHECKING:
@@ -106,12 +107,11 @@ def read_arm(path: Path, tip: str | None, T_tip_hand: np.ndarray) -> Arm:
         for element in tree.findall("link/collision"):
             element.getparent().remove(element)
         urdf, note = check_robot(path, tree, raw), f"links are told by their origins alone, and not kept apart: {error}"
-    into = {joint.child: joint for joint in urdf.joints}
-    joints = []
-    while (at := joints[-1].parent if joints else tip or _last(urdf)) in into:
-        joints.append(into[at])
+    joints = joints_above(urdf.joints, tip or _last(urdf))
     if not joints or joints[-1].parent != urdf.root:
-        raise HandError(f"URDF {path}: no link '{tip}' that joints move; it has {', '.join(into)}")
+        raise HandError(
+            f"URDF {path}: no link '{tip}' that joints move; it has {', '.join(joint.child for joint in urdf.joints)}"
+        )
     chain = tuple(reversed(joints))
     for joint in chain:
         if joint.mimic:

@@ -9,6 +9,7 @@ import numpy as np
 import lgrasp
 from lgrasp.dataset.checks import accepted_limits, are_unit, hand_problems, object_problems, requirer
 from lgrasp.grasp.records import HandRecord, ObjectRecord, now
+from lgrasp.grasp.schema import POSTURES
 from lgrasp.picture.camera import Intrinsics
 
 
@@ -120,7 +121,7 @@ def scene_problems(scene: SceneRecord) -> list[str]:
         require((cloud.view >= 0) & (cloud.view < len(views.pose)), "cloud/view: there is no such view")
         require((grasps.target >= 0) & (grasps.target < most), "grasps/target: there is no such object")
         require_poses(grasps.hand_pose, "grasps/hand_pose")
-        for name in ("q", "q_pregrasp", "q_squeeze"):
+        for name in POSTURES:
             require(np.isfinite(getattr(grasps, name)), f"grasps/{name}: not finite")
         lower, upper = accepted_limits(scene.hand)
         require((grasps.q >= lower) & (grasps.q <= upper), "grasps/q: outside the joint limits by more than 1e-4")

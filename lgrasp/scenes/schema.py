@@ -4,7 +4,7 @@ Capital letters in a shape hold across the file: ``M`` objects on the table, ``V
 ``P`` points, ``N`` grasps, ``K`` listed joints, ``L`` links.
 """
 
-from lgrasp.grasp.schema import MODEL_ATTRIBUTES, MODEL_DATASETS, AttributeSpec, DatasetSpec
+from lgrasp.grasp.schema import MODEL_ATTRIBUTES, MODEL_DATASETS, POSTURES, AttributeSpec, DatasetSpec
 
 FORMAT = "lgrasp-scene"
 FORMAT_VERSION = "1.0"
@@ -26,7 +26,7 @@ DATASETS: tuple[DatasetSpec, ...] = (
     DatasetSpec("cloud/view", "i2", ("P",)),
     DatasetSpec("grasps/target", "i4", ("N",)),
     DatasetSpec("grasps/hand_pose", "f4", ("N", 7), "m"),
-    *(DatasetSpec(f"grasps/{name}", "f4", ("N", "K"), "rad or m") for name in ("q", "q_pregrasp", "q_squeeze")),
+    *(DatasetSpec(f"grasps/{name}", "f4", ("N", "K"), "rad or m") for name in POSTURES),
     DatasetSpec("grasps/table_depth", "f4", ("N", 2), "m"),
     DatasetSpec("grasps/object_depth", "f4", ("N", 2), "m"),
     DatasetSpec("grasps/collision_free", "?", ("N",)),

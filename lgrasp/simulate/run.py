@@ -15,6 +15,7 @@ import numpy as np
 from lgrasp.errors import PhysicsError
 from lgrasp.geometry.poses import shifted
 from lgrasp.grasp.records import GraspRows
+from lgrasp.grasp.schema import POSTURES
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.runtime.processes import ProcessPool, none_killed
 from lgrasp.simulate.engines import check_engine, engine_text
@@ -72,7 +73,7 @@ def group_rows(rows: GraspRows, solids: Sequence[Solid]) -> Iterator[Group]:
         centers = np.stack([solids[k].center for k in taken])
         arrays["object_pose"] = shifted(arrays["object_pose"], centers)
         arrays["contact_points"] = arrays["contact_points"] - centers[:, None]
-        arrays |= {name: getattr(rows, name)[found] for name in ("q", "q_pregrasp", "q_squeeze", "candidate")}
+        arrays |= {name: getattr(rows, name)[found] for name in (*POSTURES, "candidate")}
         arrays["table"] = {name: values[found] for name, values in rows.table.items()}
         bare = replace(rows, **arrays, metrics={}, metric_units={}, physics={}, physics_protocols={}, sequence=None)
         yield Group(taken, found, rank[found], bare)

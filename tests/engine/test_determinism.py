@@ -67,7 +67,7 @@ def test_batches_on_a_gpu_are_enough_and_not_more():
     first = size("cuda:0", 50_000, 1.7, 0)
     assert 50_000 < first * 1.7 < 55_000
     assert size("cuda:0", 50_000, 1.7, first) == 0
-    assert size("cuda:0", 1000, 1e-3, 0) == 65_536
+    assert size("cuda:0", 1000, 1e-3, 0) == 524_288
     assert size("cuda:0", 1000, 1e-3, 0, 5_000) == 5_000
 
 

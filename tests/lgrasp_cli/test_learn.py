@@ -95,7 +95,7 @@ def test_shards_that_cannot_be_learned_from(generate, cli, tmp_path):
     line = refused("whole", "other")
     assert "jaws-cube-00000.h5: its grasps are of hand 'jaws'" in line
     assert f"those of whole/{path.name} of 'allegro'" in line
-    assert "out is a folder; name a file" in cli("learn", "fit", "out", "--out", "out", "--device", "cpu").error()
+    assert "out cannot be written: it is a folder" in cli("learn", "fit", "out", "--out", "out", "--device", "cpu").error()
 
 
 def test_files_that_are_no_predictors(cli):

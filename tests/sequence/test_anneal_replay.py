@@ -25,11 +25,9 @@ def test_equals_steps_one_by_one(room):
         return [total + chosen.sum(), drawn * 0.99 + step]
 
     start = [torch.zeros(3, dtype=torch.int64, device=device), torch.zeros(3, device=device)]
-    told: list[int] = []
-    found = replayed(advance, start, 230, culling, told.append)
+    found = replayed(advance, start, 230, culling)
     state = start
     for k in range(230):
         state = advance(torch.tensor(k, device=device), state)
-    assert told == [100, 200, 230]
     assert all(torch.equal(a, b) for a, b in zip(found, state, strict=True))
     assert not start[0].any()

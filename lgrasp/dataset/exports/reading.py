@@ -14,6 +14,7 @@ from lgrasp.dataset.files import parsing
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import canonical, inverse
 from lgrasp.grasp.records import GraspRows
+from lgrasp.grasp.schema import POSTURES
 from lgrasp.object.find import mesh_files
 
 
@@ -156,7 +157,7 @@ class ExportFolder:
         pose = np.concatenate([object_pose[..., :3], canonical(object_pose[..., 3:])], -1)
         nothing = np.zeros((n, width, 0, 3), np.float32)
         grasps = GraspRows(
-            **dict(zip(("q", "q_pregrasp", "q_squeeze"), np.moveaxis(q, 1, 0).astype(np.float32), strict=True)),
+            **dict(zip(POSTURES, np.moveaxis(q, 1, 0).astype(np.float32), strict=True)),
             object_pose=pose.astype(np.float32),
             object_index=object_index.astype(np.int32),
             contact_points=nothing,

@@ -17,7 +17,7 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.split import Split
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.grasp.schema import CHUNK_ROWS
+from lgrasp.grasp.schema import CHUNK_ROWS, POSTURES
 from lgrasp.words import plural
 
 _NUMBER = re.compile("metrics/|physics/|candidate$")
@@ -161,7 +161,7 @@ class Selection:
         holds = np.ones(len(some))
         for name in verdict_columns(reader):
             holds *= read(name) > 0
-        q, before, squeeze = (read(name)[:, source.columns] for name in ("q", "q_pregrasp", "q_squeeze"))
+        q, before, squeeze = (read(name)[:, source.columns] for name in POSTURES)
         table = {}
         if source.on_table:  # such rows hold one object
             planes = zip(read("object_index")[:, 0], read("table/pose"), strict=True)

@@ -13,7 +13,8 @@ from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome, failed_bounds
 from lgrasp.grasp.records import GraspRows, padded
-from lgrasp.grasp.rows import POSTURES, grasp_rows, press
+from lgrasp.grasp.rows import grasp_rows, press
+from lgrasp.grasp.schema import POSTURES
 from lgrasp.grasp.tables import CONTACTS, GraspTable, choose_grasps, join_rows, widen_grasps
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.math.limits import MAX_CONTACTS

@@ -8,8 +8,8 @@ from pydantic import Field
 from lgrasp.config import HandName, MeshScale
 from lgrasp.engine.pipeline import NamedPipeline, load_pipeline
 from lgrasp.engine.request import Request
-from lgrasp.errors import ConfigError, OutputError
-from lgrasp.files import check_folder
+from lgrasp.errors import ConfigError
+from lgrasp.files import check_file
 from lgrasp.hand.names import hand_path
 from lgrasp.learn.params import PosePolicyParams
 from lgrasp.object.find import find_object
@@ -29,8 +29,7 @@ class PolicyRequest(Request):
     params: PosePolicyParams = Field(default_factory=PosePolicyParams)
 
     def check(self) -> None:
-        if self.out.is_dir():
-            raise OutputError(f"{self.out} is a folder; name a file with --out, such as policy.npz")
+        check_file(self.out)
         if not self.pipeline.realised or self.pipeline.sequence is not None:
             raise ConfigError(
                 f"pipeline '{self.pipeline.name}': a policy is trained where ik comes before search, of one object"
@@ -40,4 +39,3 @@ class PolicyRequest(Request):
         hand_path(self.hand)
         for name in self.objects:
             find_object(name)
-        check_folder(self.out.parent)

@@ -15,7 +15,7 @@ from lgrasp.hand.names import hand_path
 from lgrasp.jobs.requests.shards import look_up
 from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
-from lgrasp.paths import check_file
+from lgrasp.paths import check_input
 from lgrasp.planning.params import PlanParams
 
 
@@ -75,9 +75,9 @@ class PlanRequest(Request):
         if self.object is not None:
             look_up(self.object, find_object)
         if isinstance(self.cloud, Path):
-            check_file(self.cloud, CLOUD_SUFFIXES, "a point cloud", CloudError)
+            check_input(self.cloud, CLOUD_SUFFIXES, "a point cloud", CloudError)
         if self.mask is not None:
-            check_file(self.mask, MASK_SUFFIXES, "a mask", CloudError)
+            check_input(self.mask, MASK_SUFFIXES, "a mask", CloudError)
         if self.model is not None:
             check_network(self.model, "grasp", self.hand)
         if self.out is not None:

@@ -2,6 +2,7 @@
 
 from itertools import zip_longest
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, ClassVar, Self
 
 from pydantic import Field, ValidationInfo, model_validator
@@ -11,13 +12,13 @@ from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
 from lgrasp.config import HandName, Negatives, OtherSeed, Params, ShardFolder, Viewpoint, parse_model
 from lgrasp.engine.folder import check_number, run_folder
 from lgrasp.engine.pipeline import NamedPipeline, Pipeline
-from lgrasp.engine.request import Request, named
+from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path, known_hands
 from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
-from lgrasp.paths import check_file
+from lgrasp.paths import check_input
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import NO_TABLE, PROTOCOLS, find_protocol
 
@@ -31,7 +32,7 @@ def hand_name(hand: str) -> str:
     if hand in known_hands():  # one of the catalogue is called by its folder
         return hand
     hand_path(hand)
-    return named("lgrasp.jobs.hands:hand_source")(hand).name  # slow to load: only for what is there
+    return resolve_name("lgrasp.jobs.hands:hand_source")(hand).name  # slow to load: only for what is there
 
 
 def sequence_name(objects: tuple[str, ...]) -> str:
@@ -233,9 +234,9 @@ class SampleRequest(SequenceRequest):
 
     def _check_clouds(self) -> None:
         for path, mask, _ in self.targets:
-            check_file(path, CLOUD_SUFFIXES, "a point cloud", CloudError)
+            check_input(path, CLOUD_SUFFIXES, "a point cloud", CloudError)
             if mask is not None:
-                check_file(mask, MASK_SUFFIXES, "a mask", CloudError)
+                check_input(mask, MASK_SUFFIXES, "a mask", CloudError)
         if self.simulate:
             raise ConfigError(f"--simulate {self.simulate}: a simulator needs meshes, not --cloud")
         if parse_size(self.scale).high:

@@ -13,14 +13,14 @@ from lgrasp.dataset.exports.options import check_options
 from lgrasp.dataset.files import find_shards, shards_below
 from lgrasp.engine.request import Request, ShardRequest
 from lgrasp.errors import ConfigError, HandError, OutputError, ShardError
-from lgrasp.files import check_folder
+from lgrasp.files import check_file, check_folder
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.names import hand_path
 from lgrasp.hold.params import HoldTest
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.params import LearnParams
-from lgrasp.paths import check_file
+from lgrasp.paths import check_input
 from lgrasp.reach.placement import ORIGIN, Placement
 from lgrasp.refine.params import COARSE, LocalSearch
 from lgrasp.simulate.protocol import Protocol, find_protocol
@@ -86,7 +86,7 @@ class ReachRequest(VerdictRequest):
     def check(self) -> None:
         if self.device.startswith("cuda"):
             raise ConfigError(f"device '{self.device}': lgrasp reach searches on the CPU; leave it out")
-        check_file(self.arm, (".urdf",), "--arm: a URDF", HandError)
+        check_input(self.arm, (".urdf",), "--arm: a URDF", HandError)
         super().check()
 
 
@@ -174,13 +174,10 @@ class FitRequest(Request):
     hand: str | None = Field(None, description="Default: that of the shards.")
 
     def check(self) -> None:
-        if self.out.is_dir():
-            usual = type(self).model_fields["out"].default
-            raise OutputError(f"{self.out} is a folder; name a file with --out, such as {usual}")
+        check_file(self.out)
         shards_below(self.shards)
         if self.hand is not None:
             hand_path(self.hand)
-        check_folder(self.out.parent)
 
 
 class DiffuserRequest(FitRequest):

@@ -13,13 +13,14 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.grasp.schema import POSTURES
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.shard_inputs import hand_of_shard, mesh_hash
 from lgrasp.runtime.device import Device
 
-_COLUMNS = ("q", "q_pregrasp", "q_squeeze", "candidate")
+_COLUMNS = (*POSTURES, "candidate")
 
 
 @dataclass

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lgrasp.engine.cache import Cache, content_key, json_digest
-from lgrasp.engine.inputs import Loader, Report, object_key
+from lgrasp.engine.inputs import Loader, Report, field_key, hand_model_key, object_key
 from lgrasp.errors import ConfigError
 from lgrasp.field.arrays import FieldArrays, upload_field
-from lgrasp.field.model import FIELD_VERSION
 from lgrasp.field.params import FieldParams
 from lgrasp.grasp.predicted import record_of_points
 from lgrasp.hand.arrays import HandArrays, upload_hand
@@ -112,13 +111,12 @@ def sequence_keys(
             "(lgrasp hands add proposes them)"
         )
     digest = hand_digest(source.urdf, source.spec)
-    hand_key = content_key("hand", HAND_VERSION, content=digest)
     spaces = described_spaces(source.spec, source.spec.opposition_spaces)
     view = content_key("hand", HAND_VERSION, content=digest, spaces=spaces)
-    field = content_key("field", FIELD_VERSION, hand=view, params=fields.model_dump(mode="json"))
     paths = tuple(find_object(mesh) for mesh in meshes)
     scales = _object_scales(paths, size, seed)
     keys = tuple(object_key(str(p), s, objects)[1] for p, s in zip(paths, scales, strict=True))
+    hand_key, field = hand_model_key(digest), field_key(view, fields)
     return SequenceKeys(source, hand_key, view, field, tuple(p.stem for p in paths), paths, scales, keys)
 
 

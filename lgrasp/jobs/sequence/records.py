@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from lgrasp.grasp.records import GraspRows, ObjectRecord, SequenceRows, padded
-from lgrasp.grasp.rows import METRIC_UNITS, POSTURES, row_numbers, step_columns, used_width
+from lgrasp.grasp.rows import METRIC_UNITS, row_numbers, step_columns, used_width
+from lgrasp.grasp.schema import POSTURES
 from lgrasp.grasp.sequences import SequenceTable
 from lgrasp.grasp.tables import CONTACTS
 from lgrasp.jobs.records import object_record

@@ -77,7 +77,6 @@ def run_chain(
     *,
     switch: float,
     culling: Culling | None = None,
-    progress: Callable[[int], None] | None = None,
 ) -> Chain:
     """Run N chains; every row depends on its own start, seed and energies alone.
 
@@ -86,7 +85,6 @@ def run_chain(
             probability ``switch`` in each step. seed: (N,) int64.
         weights: (S, T) of the energies in each of S steps. Energies of the state are reweighted in each step.
         culling: of the energies; with it steps on a GPU are recorded once and replayed.
-        progress: called with the number of steps done.
     """
 
     def advance(step: torch.Tensor, chain: Chain) -> Chain:
@@ -105,11 +103,9 @@ def run_chain(
     terms, gradient = proposals.evaluate(x, contact, weights[0])
     chain = Chain(x, contact, terms, gradient, torch.zeros_like(gradient))
     if x.is_cuda and culling is not None:
-        return Chain._make(replayed(lambda k, s: advance(k, Chain._make(s)), chain, len(weights), culling, progress))
+        return Chain._make(replayed(lambda k, s: advance(k, Chain._make(s)), chain, len(weights), culling))
     for k in range(len(weights)):
         chain = advance(torch.tensor(k, device=x.device), chain)
-        if progress is not None:
-            progress(k + 1)
     return chain
 
 

@@ -2,7 +2,7 @@
 object's hull: methods ``anneal`` and ``mala``."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -52,7 +52,6 @@ def optimise(
     method: Literal["anneal", "mala"] = "anneal",
     device: str = "cpu",
     rows: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Optimised:
     """Grasp the last object in H rows that hold the objects before it.
 
@@ -66,7 +65,6 @@ def optimise(
         held: poses of the objects held, internal frames, device poses (H, n - 1, 7).
         seed: of each row, (H,) integers.
         rows: how many are worked on at once; no result on a CPU depends on it.
-        progress: called with steps done and steps in all.
     """
     energy = GraspEnergy(
         hand,
@@ -80,7 +78,7 @@ def optimise(
     rows = rows or (_CPU_ROWS if device == "cpu" else _GPU_ROWS)
     blocks = [np.arange(first, min(first + rows, len(q))) for first in range(0, len(q), rows)]
     parts = []
-    for number, block in enumerate(blocks):
+    for block in blocks:
         # on a GPU sums depend on the number of rows, so it is always the same there
         filled = block if device == "cpu" else np.resize(block, rows)
 
@@ -89,10 +87,6 @@ def optimise(
 
         at = motion_from_pose(put(held, torch.float32))
         problem = GraspProblem(energy, sides, put(space, torch.int64), at)
-
-        def report(step: int, before: int = number * params.iterations) -> None:
-            if progress is not None:
-                progress(before + step, len(blocks) * params.iterations)
 
         columns = _optimise_block(
             hand,
@@ -103,7 +97,6 @@ def optimise(
             put(seed.astype(np.int64), torch.int64),
             params,
             method,
-            report,
         )
         parts.append([column[: len(block)].cpu().numpy() for column in columns])
     pose, joints, hand_point, object_point, energies = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -119,7 +112,6 @@ def _optimise_block(
     seed: torch.Tensor,
     params: OptimiserParams,
     method: str,
-    progress: Callable[[int], None],
 ) -> list[torch.Tensor]:
     """Columns of :class:`Optimised`."""
     R, t = start_poses(hand, objects, problem.held, uniforms(seed, params.iterations + 1, 7))
@@ -131,7 +123,6 @@ def _optimise_block(
         torch.as_tensor(_weights(params), dtype=q.dtype, device=q.device),
         switch=params.switch,
         culling=problem.energy.culling,
-        progress=progress,
     )
     q = torch.where(free, chain.x[:, 9:].clamp(problem.energy.lower, problem.energy.upper), q)
     R, t = matrix_from_sixd(chain.x[:, 3:9]), chain.x[:, :3]

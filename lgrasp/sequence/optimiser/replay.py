@@ -12,13 +12,7 @@ _WARM_UP_STEPS = 3
 _Advance = Callable[[torch.Tensor, Sequence[torch.Tensor]], Sequence[torch.Tensor]]
 
 
-def replayed(
-    advance: _Advance,
-    state: Sequence[torch.Tensor],
-    steps: int,
-    culling: Culling,
-    progress: Callable[[int], None] | None = None,
-) -> list[torch.Tensor]:
+def replayed(advance: _Advance, state: Sequence[torch.Tensor], steps: int, culling: Culling) -> list[torch.Tensor]:
     """The state after ``steps`` steps: ``advance(k, state)`` for k = 0, 1, ...
 
     A stretch of steps in which the energies lacked room for their entries is gone through again with more.
@@ -27,7 +21,6 @@ def replayed(
         advance: steps are tensors; it must not wait for the device.
         state: (N, ...) tensors on a GPU.
         culling: of the energies that ``advance`` computes.
-        progress: called with the number of steps done.
     """
     rows, device = len(state[0]), state[0].device
     now, step = [x.clone() for x in state], torch.zeros((), dtype=torch.int64, device=device)
@@ -47,8 +40,6 @@ def replayed(
                     x.copy_(y)
                 continue
             done += size
-            if progress is not None:
-                progress(done)
     finally:
         culling.free()
     return now
