@@ -6,11 +6,11 @@ import importlib
 import io
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from support.fresh import HEAVY, loaded
 from support.places import ROOT
 
 import lgrasp as lg
@@ -31,9 +31,7 @@ def test_every_name_is_there():
 
 
 def test_importing_loads_nothing():
-    code = "import sys, lgrasp; print([m for m in sys.modules if m.startswith('lgrasp.') or m in ('numpy', 'torch')])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert result.stdout.strip() == "[]"
+    assert loaded("import lgrasp", ["lgrasp.", *HEAVY]) == []
 
 
 def test_functions_keep_their_names_beside_rooms():

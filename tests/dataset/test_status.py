@@ -2,11 +2,10 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from support.fresh import SLOW, loaded
 from support.jobs import SampleJob, StopAfter
 from support.shards import sample_shard
 from typer.testing import CliRunner
@@ -133,6 +132,4 @@ def test_copies_say_what_is_missing(tmp_path, said):
 
 
 def test_status_loads_nothing_slow():
-    code = "import sys, lgrasp_cli.status, lgrasp.dataset.status\n"
-    code += "print([m for m in ('torch', 'warp', 'scipy', 'trimesh', 'mujoco') if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert loaded("import lgrasp_cli.status, lgrasp.dataset.status", [*SLOW, "warp"]) == []

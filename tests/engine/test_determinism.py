@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.same import assert_same
 
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.batch import run_batch
@@ -10,12 +11,6 @@ from lgrasp.engine.shard import Execution, make_shard
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import grasp_arrays, join_rows
 from lgrasp.stages.context import Context
-
-
-def assert_same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
-    assert a.keys() == b.keys()
-    for name in a:
-        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
 
 @pytest.fixture(scope="module", params=["swift", "lightning"])

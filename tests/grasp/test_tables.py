@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.same import assert_same
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.geometry.poses import user_poses
@@ -12,13 +13,6 @@ from lgrasp.grasp.tables import CandidateTable, grasp_arrays, join_rows, select_
 @pytest.fixture(scope="module")
 def tables(swift, context):
     return {stage: run_stages(swift, context, 0, 256, stage) for stage in ("place", "ik", "search", "filter")}
-
-
-def assert_same(a, b):
-    assert a.keys() == b.keys()
-    for name in a:
-        assert a[name].dtype == b[name].dtype
-        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
 
 
 @pytest.mark.parametrize("stage", ["place", "ik", "search"])

@@ -2,12 +2,11 @@
 
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from support.fresh import loaded
 from support.hands import REAL, minimal_spec
 from support.places import ROOT
 
@@ -213,9 +212,5 @@ def test_hand_without_solids(tmp_path):
 
 
 def test_a_hand_is_found_without_drafting():
-    code = (
-        "import sys; from lgrasp.jobs.hands import hand_source; hand_source('allegro'); "
-        "print([m for m in sys.modules if m.startswith('lgrasp.hand.drafting')])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+    code = "from lgrasp.jobs.hands import hand_source; hand_source('allegro')"
+    assert loaded(code, ["lgrasp.hand.drafting"]) == []

@@ -6,28 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from lgrasp.dataset.reader import read_shard
 from lgrasp.errors import ConfigError
 from lgrasp.judge.run import judge
 
-ROWS = 10
 HANDLE = "box:0.026,-1,-1:1,1,1"
 TOP, LOW = "box:-1,-1,0.06:1,1,1", "box:-1,-1,-1:1,1,0.06"
-
-
-@pytest.fixture
-def steered(run, swift, tmp_path):
-    """steered(**asked): a shard of grasps of the mug that are steered so, and its file."""
-
-    def steered(pipeline=swift, rows=ROWS, **asked):
-        out = tmp_path / pipeline.with_steering(**asked).steer.tag
-        outcome = run(pipeline=pipeline.with_steering(**asked), rows=rows, shard_rows=rows, out=out)
-        (path,) = outcome.paths
-        shard = read_shard(path)
-        assert len(shard.grasps) == rows
-        return shard, path
-
-    return steered
 
 
 def contacts(shard):

@@ -26,20 +26,6 @@ from lgrasp.judge.run import judge
 FINGERS = find_hand("allegro").spec.fingers
 
 
-@pytest.fixture
-def steered(run, swift, tmp_path):
-    """steered(**asked): a small shard of grasps of the mug that are steered so."""
-
-    def steered(pipeline=swift, rows=16, **asked):
-        outcome = run(pipeline=pipeline.with_steering(**asked), rows=rows, shard_rows=rows, out=tmp_path / "steered")
-        (path,) = outcome.paths
-        shard = read_shard(path)
-        assert len(shard.grasps) == rows
-        return shard
-
-    return steered
-
-
 def touching(shard):
     """Names of the links that touch, row by row."""
     names = np.array(shard.hand.link_names)
@@ -48,7 +34,7 @@ def touching(shard):
 
 @pytest.mark.parametrize("asked", ["thumb,index,middle", ("thumb", "link_7.0_tip")])
 def test_exactly_these_fingers_touch(steered, asked):
-    shard = steered(fingers=asked)
+    shard, _ = steered(rows=16, fingers=asked)
     named = asked.split(",") if isinstance(asked, str) else asked
     wanted = {name if name in FINGERS else next(f for f, links in FINGERS.items() if name in links) for name in named}
     for links in touching(shard):
@@ -57,9 +43,9 @@ def test_exactly_these_fingers_touch(steered, asked):
     assert shard.header.config["pipeline"]["steer"]["fingers"] == list(named)
 
 
-def test_a_lateral_grasp_touches_with_the_side_of_the_index_finger(steered, link_poses, tmp_path):
+def test_a_lateral_grasp_touches_with_the_side_of_the_index_finger(steered, link_poses):
     """Its radial side looks along y of its links, and the thumb's tip presses against it; the judge finds another."""
-    shard = steered(grasp_type="lateral", rows=6)
+    shard, path = steered(grasp_type="lateral", rows=6)
     rows, names = shard.grasps, np.array(shard.hand.link_names)
     assert all(
         "link_15.0_tip" in links and links & {"link_2.0", "link_3.0", "link_3.0_tip"} and len(links) == 2
@@ -70,7 +56,6 @@ def test_a_lateral_grasp_touches_with_the_side_of_the_index_finger(steered, link
     inward = -np.einsum("nij,nj->ni", T[row, :3, :3], rows.contact_normals[row, 0, at])
     link = link_poses(rows.q)[row, rows.contact_links[row, 0, at]]
     assert (np.einsum("nji,nj->ni", link[:, :3, :3], inward)[:, 1] > np.cos(np.radians(40 + 15))).all()
-    (path,) = (tmp_path / "steered").glob("*.h5")
     assert judge(path).valid_share == 1.0
     config = shard.header.config
     sides = [side | {"axis": [0, -1, 0]} for side in config["steered"]["sides"]]
@@ -86,16 +71,15 @@ def thumb_angles(shard, link_poses):
 
 
 @pytest.mark.parametrize("asked", [{"thumb": "adducted"}, {"grasp_type": "adduction-grip"}])
-def test_the_thumb_is_where_it_is_asked_to_be(steered, link_poses, tmp_path, asked):
+def test_the_thumb_is_where_it_is_asked_to_be(steered, link_poses, asked):
     """Also where it does not touch, as in an adduction grip; the judge agrees, and finds rows with another thumb."""
-    shard = steered(rows=6, **asked)
+    shard, path = steered(rows=6, **asked)
     angles, adducted = thumb_angles(shard, link_poses), asked.get("thumb") == "adducted"
     middle = shard.header.config["steered"]["thumb"]["angle"]
     assert 45 < middle < 55  # its range is 15 to 86
     assert (angles < middle + 0.01).all() if adducted else (angles > middle - 0.01).all()
     if "grasp_type" in asked:
         assert not any("link_15.0_tip" in links for links in touching(shard))
-    (path,) = (tmp_path / "steered").glob("*.h5")
     assert judge(path).valid_share == 1.0
     config = shard.header.config
     for change in ({"place": "abducted" if adducted else "adducted"}, {"link": "thumb"}):
@@ -123,19 +107,19 @@ def test_fingers_of_the_published_index(lightning, load):
 
 def test_only_these_links_touch(steered):
     allowed = ["link_3.0_tip", "link_7.0_tip", "link_15.0_tip"]
-    assert set().union(*touching(steered(links=allowed))) == set(allowed)
+    assert set().union(*touching(steered(rows=16, links=allowed)[0])) == set(allowed)
 
 
 @pytest.mark.parametrize("palm", ["no", "must"])
 def test_the_palm_touches_as_asked(steered, palm):
-    touches = ["base_link" in links for links in touching(steered(palm=palm, rows=12))]
+    touches = ["base_link" in links for links in touching(steered(palm=palm, rows=12)[0])]
     assert all(touches) if palm == "must" else not any(touches)
 
 
 @pytest.mark.parametrize(("approach", "sources"), [("1,2,0:8", {}), ("0,1,0:15", {"palm": "must"})])
 def test_the_palm_faces_into_the_cone(steered, approach, sources):
     """Also where the object is pressed on the palm; Allegro's palm faces along x of its base."""
-    rows = steered(rows=12, approach=approach, **sources).grasps
+    rows = steered(rows=12, approach=approach, **sources)[0].grasps
     faces = pose_matrix(rows.object_pose[:, 0].astype(float))[:, 0, :3]
     direction, _, angle = approach.partition(":")
     middle = np.array(direction.split(","), float)
@@ -155,7 +139,7 @@ def test_every_source_of_poses_stays_in_the_cone(swift, load):
 
 
 def test_the_hand_stays_above_the_plane(steered, solids, link_poses):
-    rows = steered(above="0,0.6,0.8,0.01", rows=12).grasps
+    rows = steered(above="0,0.6,0.8,0.01", rows=12)[0].grasps
     T = pose_matrix(rows.object_pose[:, 0].astype(float))
     for q in (rows.q, rows.q_pregrasp):
         links = np.linalg.inv(T)[:, None] @ link_poses(q)
@@ -165,9 +149,8 @@ def test_the_hand_stays_above_the_plane(steered, solids, link_poses):
             assert (points @ [0, 0.6, 0.8]).min() > 0.0109
 
 
-def test_the_judge_agrees_and_finds_rows_that_do_not_obey(steered, tmp_path):
-    steered(rows=4, fingers="thumb,index,middle", palm="no", approach="1,0,0:40", above="0,0,1,0.001")
-    (path,) = (tmp_path / "steered").glob("*.h5")
+def test_the_judge_agrees_and_finds_rows_that_do_not_obey(steered):
+    _, path = steered(rows=4, fingers="thumb,index,middle", palm="no", approach="1,0,0:40", above="0,0,1,0.001")
     assert judge(path).valid_share == 1.0
     with h5py.File(path) as file:
         config = json.loads(file.attrs["config"])
@@ -186,9 +169,9 @@ def test_the_judge_agrees_and_finds_rows_that_do_not_obey(steered, tmp_path):
 
 
 def test_refined_rows_are_free_but_stay_above_the_plane(steered, cache_root, tmp_path):
-    steered(rows=6, fingers="thumb,index,middle", above="0,0,1,0.001")
+    _, path = steered(rows=6, fingers="thumb,index,middle", above="0,0,1,0.001")
     cache = Cache(cache_root, pytest.fail)
-    job = RefineJob(shards=(tmp_path / "steered",), out=tmp_path / "refined", device="cpu", cache=cache)
+    job = RefineJob(shards=(path.parent,), out=tmp_path / "refined", device="cpu", cache=cache)
     (path,) = run_job(job).paths
     assert read_shard(path).header.config["steered"] == {"above": [0, 0, 1, 0.001]}
     failed = judge(path).failed
@@ -204,16 +187,16 @@ def unsteered(small_job, tmp_path_factory):
 
 @pytest.mark.parametrize("kind", [".csv", ".h5"])
 def test_the_object_is_where_the_file_says(steered, unsteered, tmp_path, kind):
-    path = unsteered
-    poses = np.unique(read_shard(path).grasps.object_pose[:, 0].astype(float), axis=0)  # some have several rows
+    given = unsteered
+    poses = np.unique(read_shard(given).grasps.object_pose[:, 0].astype(float), axis=0)  # some have several rows
     if kind == ".csv":
-        path = tmp_path / "poses.csv"
-        np.savetxt(path, poses, delimiter=",", header="x,y,z,qw,qx,qy,qz", comments="")
-    found = steered(pose=path, rows=10).grasps.object_pose[:, 0]
+        given = tmp_path / "poses.csv"
+        np.savetxt(given, poses, delimiter=",", header="x,y,z,qw,qx,qy,qz", comments="")
+    shard, path = steered(pose=given)
+    found = shard.grasps.object_pose[:, 0]
     assert np.abs(found[:, None] - poses[None]).max(2).min(1).max() < 1e-5
     assert len(np.unique(found.round(4), axis=0)) > 1
     if kind == ".csv":
-        (path,) = (tmp_path / "steered").glob("*.h5")
         obeys_only_its_poses(path)
 
 
@@ -234,7 +217,7 @@ def obeys_only_its_poses(path):
 def test_poses_of_the_hand(steered, unsteered, tmp_path):
     T = pose_matrix(read_shard(unsteered).grasps.object_pose[:, 0].astype(float))
     np.savez(tmp_path / "hand.npz", T_object_hand=np.linalg.inv(T))
-    found = pose_matrix(steered(pose=tmp_path / "hand.npz", rows=5).grasps.object_pose[:, 0].astype(float))
+    found = pose_matrix(steered(pose=tmp_path / "hand.npz", rows=5)[0].grasps.object_pose[:, 0].astype(float))
     assert np.abs(found[:, None] - T[None]).max((2, 3)).min(1).max() < 1e-5
 
 
@@ -249,8 +232,8 @@ def test_a_steering_without_poses_ends_early(job, swift, tmp_path, monkeypatch):
 
 
 def test_a_plane_is_no_table_to_lift_from(steered, job, swift, tmp_path):
-    steered(rows=2, above="0,0,1,0.001")
-    given = {"shards": (tmp_path / "steered",), "protocol": "lift", "out": tmp_path / "lifted"}
+    _, path = steered(rows=2, above="0,0,1,0.001")
+    given = {"shards": (path.parent,), "protocol": "lift", "out": tmp_path / "lifted"}
     with pytest.raises(PhysicsError, match=r"allegro-mug-00000\.h5: the plane of --above .* generate --table"):
         run_job(parse_model(SimulateJob, given, "simulate"))
     lifted = swift.with_simulation("lift")

@@ -6,10 +6,9 @@ import subprocess
 import sys
 
 import pytest
+from support.fresh import HEAVY
 
 from lgrasp.runtime.driver import has_driver
-
-HEAVY = ("torch", "warp", "trimesh", "scipy", "h5py", "numpy", "mujoco", "matplotlib", "yourdfpy", "coacd")
 
 LISTS = """
 hands list

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 import warp as wp
+from support.fresh import HEAVY, SLOW, loaded
 from support.places import TINY_SHARD
 
 import lgrasp
@@ -65,17 +66,9 @@ def test_no_command_prints_help(cli):
     assert "error" not in result.err
 
 
-HEAVY = ("numpy", "warp", "torch", "h5py", "pydantic", "yaml")
-
-
 def test_help_is_light():
-    code = "import sys; sys.argv = ['lgrasp', '--help']\nfrom lgrasp_cli.main import main\n"
-    code += f"try:\n    main()\nfinally:\n    print([m for m in {HEAVY} if m in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.splitlines()[-1] == "[]"
-
-
-SLOW = ("scipy", "trimesh", "yourdfpy", "torch", "mujoco", "coacd", "matplotlib", "networkx", "PIL")
+    code = "import sys; sys.argv = ['lgrasp', '--help']; from lgrasp_cli.main import main; main()"
+    assert loaded(code, [*HEAVY, "pydantic", "yaml"]) == []
 
 
 def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_path):
@@ -128,9 +121,10 @@ main()
     assert (done.returncode, done.stdout) == (130, "[]\n"), done.stderr
 
 
-def test_mujoco_looks_for_no_screen():
+def test_mujoco_looks_for_no_screen(monkeypatch):
     """It starts a process for that, which a signal leaves behind with a traceback."""
     pytest.importorskip("mujoco")
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
     code = """
 import os, sys
 from lgrasp_cli import __main__ as command
@@ -138,8 +132,5 @@ os._exit = lambda code: None
 sys.argv = ["lgrasp", "--version"]
 command.main()
 import mujoco
-print("glfw" in sys.modules)
 """
-    environment = {name: text for name, text in os.environ.items() if name != "MUJOCO_GL"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
-    assert done.stdout.split()[-1] == "False"
+    assert loaded(code, ["glfw"]) == []

@@ -10,16 +10,16 @@ import trimesh
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 from support.jaws import Jaws, mesh_record, shipped_hand
+from support.judging import judge
 from support.solids import no_cut
 
 from lgrasp.errors import PhysicsError
 from lgrasp.simulate.draws import Draw, draw_of, tune
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.protocol import PROTOCOLS, Draws, Protocol
-from lgrasp.simulate.run import protocol_text, verdicts
+from lgrasp.simulate.run import protocol_text
 from lgrasp.simulate.scene import Scene, hand_of_record, scene_of
 from lgrasp.simulate.solid import object_of_record
-from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -36,12 +36,6 @@ def fc_random(engine):
 
 def drawing(**draws) -> Protocol:
     return RANDOM.model_copy(update={"draws": Draws(**draws)})
-
-
-def judge(shard, protocol, rows=None, **more):
-    found = verdicts(scene_of(shard.hand, shard.objects), rows or shard.grasps, protocol, **more)
-    assert set(found) == {f"{protocol.name}_{name}" for name in COLUMNS | DRAWN_COLUMNS}
-    return {name.removeprefix(f"{protocol.name}_"): values for name, values in found.items()}
 
 
 def test_draws_fill_their_ranges():

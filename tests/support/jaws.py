@@ -1,4 +1,4 @@
-"""A gripper with two sliding jaws around a cube: a grasp whose forces are known."""
+"""A gripper with two sliding jaws: around a cube a grasp whose forces are known, with a ball inputs of stages."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -7,16 +7,27 @@ import numpy as np
 import trimesh
 from support.urdfs import gripper
 
+from lgrasp.field.arrays import upload_field
+from lgrasp.field.build import build_field
+from lgrasp.field.params import FieldParams
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, Shard, ShardHeader
+from lgrasp.hand.arrays import upload_hand
+from lgrasp.hand.build import build_hand
 from lgrasp.hand.find import find_hand
+from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import read_urdf
+from lgrasp.object.arrays import upload_object
+from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
+from lgrasp.stages.context import Context
 
-__all__ = ["EDGE", "HEIGHT", "Jaws", "jaw_shard", "mesh_record", "shipped_hand"]
+__all__ = ["EDGE", "HEIGHT", "RADIUS", "Jaws", "jaw_shard", "jaws_and_ball", "mesh_record", "shipped_hand"]
 
 JOINTS, LINKS = ("l", "r"), ("base", "jaw_l", "jaw_r")
 EDGE, HEIGHT = 0.04, 0.055  # of the cube, and of its centre above the base [m]
 FACE = np.array([0.5 * EDGE, 0, 0])
+RADIUS = 0.02  # of the ball [m]
 
 
 def jaw_rows(press: float, opening: float = 0.01, count: int = 1) -> GraspRows:
@@ -80,6 +91,21 @@ class Jaws:
     @staticmethod
     def rows(shard: Shard, **changes: np.ndarray) -> GraspRows:
         return replace(shard.grasps, **changes)
+
+
+def jaws_and_ball(folder: Path, device: str) -> Context:
+    """Two jaws that slide along x from where they meet, 0.05 m each at most, and a ball."""
+    spec = HandSpec(
+        name="jaws",
+        contact=(ContactRule(links=("jaw_l", "jaw_r")),),
+        canonical_box=Box(min=(-0.03, -0.01, 0.04), max=(0.03, 0.01, 0.08)),
+        open_posture={"l": 0.04, "r": 0.04},
+    )
+    model = build_hand(gripper(folder), spec)
+    obj = preprocess_object(trimesh.creation.icosphere(4, RADIUS), params=ObjectParams(contact_count=2048))
+    hand = upload_hand(model, device)
+    field = upload_field(build_field(hand, FieldParams(records=2000)), model, device)
+    return Context(hand, upload_object(obj, device), field, device, 0, 0)
 
 
 def shipped_hand(name: str) -> tuple[HandRecord, Path, Tree]:

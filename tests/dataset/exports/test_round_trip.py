@@ -13,6 +13,7 @@ import yaml
 import yourdfpy
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
+from support.places import TINY_SHARD
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.dataset.exports.hand import HandFrames
@@ -196,6 +197,26 @@ def test_mujoco_opens_the_grasp(tmp_path, shards, hand):
     shard = shards.make(tmp_path / "a.h5", hand, n=3)
     export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf")
     check_scenes(mujoco, tmp_path, shard)
+
+
+def test_scenes_hold_their_grasps(tmp_path):
+    """Ten grasps of the generator in MuJoCo: nothing overlaps at the grasp, squeezing keeps objects in the hand."""
+    mujoco = pytest.importorskip("mujoco")
+    export_shards(TINY_SHARD, tmp_path / "made", "mjcf")
+    kept = 0
+    for path in sorted((tmp_path / "made" / "grasps").iterdir()):
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, model.key("grasp").id)
+        mujoco.mj_forward(model, data)
+        assert min([0, *data.contact.dist[: data.ncon]]) > -2e-3
+        mujoco.mj_resetDataKeyframe(model, data, model.key("squeeze").id)
+        mujoco.mj_kinematics(model, data)
+        start = data.body("object_0_tiny").xpos.copy()
+        for _ in range(125):
+            mujoco.mj_step(model, data)
+        kept += np.linalg.norm(data.body("object_0_tiny").xpos - start) < 0.02
+    assert kept >= 9
 
 
 @pytest.mark.parametrize(("suffix", "kind"), [("glb", "glb"), ("PLY", "ply"), ("stl", "stl_ascii"), ("STL", "stl")])

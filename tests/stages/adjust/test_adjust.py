@@ -2,50 +2,22 @@
 
 import numpy as np
 import pytest
-import trimesh
 import warp as wp
 from scipy.spatial.transform import Rotation
-from support.urdfs import gripper
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.shard import shard_context
 from lgrasp.errors import ConfigError
-from lgrasp.field.arrays import upload_field
-from lgrasp.field.build import build_field
-from lgrasp.field.params import FieldParams
 from lgrasp.grasp.tables import ContactSets
-from lgrasp.hand.arrays import upload_hand
-from lgrasp.hand.build import build_hand
-from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.jobs.hands import for_hand
 from lgrasp.math.limits import DOF_SIZES, MAX_DOFS
-from lgrasp.object.arrays import upload_object
-from lgrasp.object.params import ObjectParams
-from lgrasp.object.preprocess import preprocess_object
 from lgrasp.stages.adjust import stage
 from lgrasp.stages.adjust.motion import ROWS, add_distance, add_offset, add_turn, solve_motion, vec6
 from lgrasp.stages.adjust.params import AdjustParams
 from lgrasp.stages.adjust.stage import run
-from lgrasp.stages.context import Context
 
-RADIUS = 0.02  # [m]
 EXACT = AdjustParams(gap=2e-5, angle=3, iterations=60, patience=60, contact_indentation=0.0)
-
-
-@pytest.fixture(scope="module")
-def jaws_and_ball(tmp_path_factory, device):
-    """Two sliding jaws whose faces are at x = 0.04 + q and -0.04 - q, or so, and a ball."""
-    spec = HandSpec(
-        name="jaws",
-        contact=(ContactRule(links=("jaw_l", "jaw_r")),),
-        canonical_box=Box(min=(-0.03, -0.01, 0.04), max=(0.03, 0.01, 0.08)),
-    )
-    model = build_hand(gripper(tmp_path_factory.mktemp("jaws")), spec)
-    obj = preprocess_object(trimesh.creation.icosphere(4, RADIUS), params=ObjectParams(contact_count=2048))
-    hand = upload_hand(model, device)
-    field = upload_field(build_field(hand, FieldParams(records=2000)), model, device)
-    return Context(hand, upload_object(obj, device), field, device, 0, 0)
 
 
 def ball_between(context, pose, q):

@@ -2,47 +2,19 @@
 
 import numpy as np
 import pytest
-import trimesh
-from support.urdfs import gripper
+from support.jaws import RADIUS
 
 from lgrasp.engine.batch import run_batch, run_stages
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.shard import shard_context
-from lgrasp.field.arrays import upload_field
-from lgrasp.field.build import build_field
-from lgrasp.field.params import FieldParams
 from lgrasp.grasp.tables import PoseTable
-from lgrasp.hand.arrays import upload_hand
-from lgrasp.hand.build import build_hand
-from lgrasp.hand.spec import Box, ContactRule, HandSpec
 from lgrasp.jobs.hands import for_hand
 from lgrasp.jobs.learn.examples import make_pose_examples
 from lgrasp.learn.params import PosePolicyParams
-from lgrasp.object.arrays import upload_object
-from lgrasp.object.params import ObjectParams
-from lgrasp.object.preprocess import preprocess_object
 from lgrasp.stages.close.params import CloseParams
 from lgrasp.stages.close.stage import run
-from lgrasp.stages.context import Context
 
-RADIUS = 0.02  # [m]
 EXACT = CloseParams(gap=2e-5, contact_indentation=0.0)
-
-
-@pytest.fixture(scope="module")
-def jaws_and_ball(tmp_path_factory, device):
-    """Two jaws that slide along x from where they meet, 0.05 m each at most, and a ball."""
-    spec = HandSpec(
-        name="jaws",
-        contact=(ContactRule(links=("jaw_l", "jaw_r")),),
-        canonical_box=Box(min=(-0.03, -0.01, 0.04), max=(0.03, 0.01, 0.08)),
-        open_posture={"l": 0.04, "r": 0.04},
-    )
-    model = build_hand(gripper(tmp_path_factory.mktemp("jaws")), spec)
-    obj = preprocess_object(trimesh.creation.icosphere(4, RADIUS), params=ObjectParams(contact_count=2048))
-    hand = upload_hand(model, device)
-    field = upload_field(build_field(hand, FieldParams(records=2000)), model, device)
-    return Context(hand, upload_object(obj, device), field, device, 0, 0)
 
 
 def ball_at(context, *places):
