@@ -9,7 +9,8 @@ import trimesh
 
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES
 from lgrasp.errors import CloudError, ShardError, short_reason
-from lgrasp.object.load import quiet_parsers, read_bytes
+from lgrasp.geometry.mesh_files import quiet_parsers
+from lgrasp.object.load import read_bytes
 
 SceneCloud = Callable[[Path], dict[str, np.ndarray]]
 """Reads the merged cloud of a scene (.h5): points (n, 3) [m], normals (n, 3), labels (n,)."""

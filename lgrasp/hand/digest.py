@@ -3,7 +3,7 @@
 import hashlib
 from pathlib import Path
 
-from lgrasp.geometry.mesh_files import mesh_bytes
+from lgrasp.geometry.mesh_files import one_file
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.urdf import Urdf, read_urdf
 
@@ -18,8 +18,7 @@ def urdf_digest(urdf: Urdf, spec: HandSpec | None = None) -> str:
     h = hashlib.sha256(urdf.text.encode())
     for name in sorted(urdf.mesh_files):
         h.update(name.encode())
-        for data in mesh_bytes(urdf.mesh_files[name]).values():
-            h.update(data)
+        h.update(one_file(urdf.mesh_files[name]))
     if spec is not None:
         # neither changes a HandModel; views of opposition spaces have digests of their own
         h.update(spec.model_dump_json(exclude={"opposition_spaces", "stand_off"}).encode())

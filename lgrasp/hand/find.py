@@ -16,6 +16,7 @@ from lgrasp.notices import notice
 from lgrasp.paths import name_problem
 
 _SAME_SHAPE = 0.01  # [m] that joints of hands of one shape are apart at most
+_SAME_FRAME = 0.1  # [rad] that their frames are turned at most
 
 
 @dataclass(frozen=True)
@@ -90,23 +91,28 @@ def rules_of_known(path: Path) -> HandSource | None:
             note += "links have the same names"
             if missing:
                 note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
-            away, name = _joints_away(urdf, own), name_of_file(path, urdf.name)
+            (away, turned), name = _joints_away(urdf, own), name_of_file(path, urdf.name)
+            if turned > _SAME_FRAME:  # contacts are told in the frames of links
+                note += f"; but links are turned by up to {np.degrees(turned):.0f}° against them"
             if away > _SAME_SHAPE:
-                note += (
-                    f"; but joints are up to {1e3 * away:.0f} mm elsewhere: 'lgrasp hands add' drafts rules for them"
-                )
+                note += f"; but joints are up to {1e3 * away:.0f} mm elsewhere"
+            if other := turned > _SAME_FRAME or away > _SAME_SHAPE:
+                note += ": 'lgrasp hands add' drafts rules for them"
             added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
             spec, left_out = _without_misfits(
                 urdf, source.spec.model_copy(update={"mimic": added | missing, "approximation": "", "name": name})
             )
-            return HandSource(name, path, spec, note + left_out, source.name if away <= _SAME_SHAPE else "")
+            return HandSource(name, path, spec, note + left_out, "" if other else source.name)
     return None
 
 
-def _joints_away(urdf: Urdf, known: Urdf) -> float:
-    """How far a joint is at most from where a known hand has it on its parent link [m]."""
-    at = {j.name: j.T_parent_joint[:3, 3] for j in known.joints}
-    return max(float(np.linalg.norm(j.T_parent_joint[:3, 3] - at[j.name])) for j in urdf.joints if j.movable)
+def _joints_away(urdf: Urdf, known: Urdf) -> tuple[float, float]:
+    """How far a joint is at most from where a known hand has it on its parent link [m], and how far turned [rad]."""
+    at = {j.name: j.T_parent_joint for j in known.joints}
+    pairs = [(j.T_parent_joint, at[j.name]) for j in urdf.joints if j.movable]
+    away = max(float(np.linalg.norm(T[:3, 3] - own[:3, 3])) for T, own in pairs)
+    cosine = min(float(np.trace(T[:3, :3].T @ own[:3, :3]) - 1.0) / 2.0 for T, own in pairs)
+    return away, float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 def _without_misfits(urdf: Urdf, spec: HandSpec) -> tuple[HandSpec, str]:

@@ -16,6 +16,7 @@ from lgrasp.geometry.edges import sample_creases
 from lgrasp.geometry.hulls import convex_hull, farthest_corners, fewer_corners
 from lgrasp.geometry.mesh_files import check_whole
 from lgrasp.geometry.obj_file import read_obj
+from lgrasp.geometry.winding import outward
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.tree import Tree
@@ -23,6 +24,7 @@ from lgrasp.hand.urdf import Geometry, Urdf
 
 _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by half of it leaves +-0.2 mm
 _CYLINDER_SIDES = 32
+_SMALLEST = 5.0e-4  # [m] largest side of a mesh
 _MAX_BODIES = 16  # of one mesh
 _SHARP_CELL, _MOST_SHARP = 0.002, 96
 _CREASE_ANGLE = 45.0  # [deg]
@@ -57,6 +59,11 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
         raise HandError(f"URDF {urdf.path}: mesh {file} has no usable triangles")
     mesh = thin_mesh(mesh, MOST_FACES)
     mesh.apply_scale(geometry.size)
+    if mesh.extents.max() < _SMALLEST:
+        raise HandError(
+            f"URDF {urdf.path}: mesh {file} is {1e3 * mesh.extents.max():.2g} mm wide; the file is probably in metres "
+            "already: leave out the scale of its <mesh>"
+        )
     if mesh.extents.max() > 2.0:
         raise HandError(
             f"URDF {urdf.path}: mesh {file} is {mesh.extents.max():.3g} m wide; the file is probably in millimetres, "
@@ -66,8 +73,8 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
 
 
 def read_mesh(file: Path) -> trimesh.Trimesh:
-    """The mesh of a file as it is without a scale: in metres where a file of COLLADA states its unit, as other tools
-    read it.
+    """The mesh of a file, wound outward, without a scale: in metres where a file of COLLADA states its unit, as other
+    tools read it.
 
     Raises:
         ValueError, or whatever a parser raises: the file cannot be read.
@@ -76,10 +83,15 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
     check_whole(kind, data)
     if kind == "obj":
         raw = read_obj(data)
-        return trimesh.Trimesh(raw.vertices, raw.faces, process=True)
-    mesh = trimesh.load_mesh(file, process=True)
-    if kind == "dae" and mesh.units:
-        mesh.apply_scale(unit_conversion(mesh.units, "meters"))
+        vertices, faces = raw.vertices, raw.faces
+    else:
+        mesh = trimesh.load_mesh(file, process=True)
+        unit = unit_conversion(mesh.units, "meters") if kind == "dae" and mesh.units else 1.0
+        vertices, faces = mesh.vertices * unit, mesh.faces
+    # colours and textures keep corners apart that are one
+    mesh = trimesh.Trimesh(vertices, faces, process=True)
+    turned: list[str] = []
+    mesh.faces = outward(mesh.vertices, mesh.faces, turned) if len(mesh.faces) else mesh.faces
     return mesh
 
 

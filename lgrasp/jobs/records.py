@@ -10,6 +10,7 @@ import numpy as np
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events, PartProgress
 from lgrasp.geometry.decompose import Decompose, decompose
+from lgrasp.geometry.mesh_files import one_file
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HandModel
@@ -32,7 +33,7 @@ def hand_config(source: HandSource) -> dict[str, Any]:
 
 def mesh_blobs(urdf: Path) -> dict[str, bytes]:
     """Collision meshes of a hand by the path its URDF names, read where the hand is now, not where it was cached."""
-    return {name: file.read_bytes() for name, file in read_urdf(urdf).mesh_files.items()}
+    return {name: one_file(file) for name, file in read_urdf(urdf).mesh_files.items()}
 
 
 def hand_record(hand: HandModel, meshes: dict[str, bytes]) -> HandRecord:

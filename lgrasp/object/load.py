@@ -1,13 +1,10 @@
 """Mesh files: read, merge, orient, close small holes, check units; every repair is put in words."""
 
-import contextlib
 import hashlib
 import io
-import logging
 import os
-import warnings
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +16,10 @@ from trimesh.graph import connected_component_labels
 from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError, short_reason
-from lgrasp.geometry.edges import bodies, open_edges, winding_number
-from lgrasp.geometry.mesh_files import check_whole, mesh_bytes, mesh_digest
+from lgrasp.geometry.edges import bodies, open_edges
+from lgrasp.geometry.mesh_files import check_whole, mesh_bytes, mesh_digest, quiet_parsers
 from lgrasp.geometry.obj_file import RawMesh, read_obj
+from lgrasp.geometry.winding import outward
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.mass import united_bodies
 from lgrasp.object.params import ObjectParams
@@ -101,7 +99,7 @@ def load_mesh(
     vertices = vertices * scale
     _check_size(label, vertices[used], scale, params)
     vertices, faces = _weld(label, vertices, faces, notes)
-    faces = _orient(vertices, faces, notes)
+    faces = outward(vertices, faces, notes)
     vertices, faces = close_holes(vertices, faces, params.hole_perimeter, notes)
     loose = len(open_edges(faces))
     if loose:
@@ -127,19 +125,6 @@ def read_bytes(path: Path, suffixes: Sequence[str], what: str, error: type[Lgras
     if not data:
         raise error(f"{path}: 0 bytes; {what} ({', '.join(suffixes)}) is accepted")
     return data
-
-
-@contextlib.contextmanager
-def quiet_parsers(logger: str = "trimesh") -> Iterator[None]:
-    """Keep the parsers of files from warning or logging: whatever matters is checked on their result."""
-    log = logging.getLogger(logger)
-    before, log.disabled = log.disabled, True
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        log.disabled = before
 
 
 class _Buffers(FilePathResolver):
@@ -308,38 +293,6 @@ def _drop_twins(faces: np.ndarray, notes: list[str]) -> np.ndarray:
     if back.any():
         notes.append(f"dropped {int(back.sum())} back faces of a two-sided mesh")
     return faces[~back]
-
-
-def _orient(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Make the winding consistent and outward, body by body; cavities stay inward."""
-    if len(open_edges(faces)):
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        if not mesh.is_winding_consistent:
-            with quiet_parsers():
-                trimesh.repair.fix_winding(mesh)
-            turned = int((mesh.faces != faces).any(axis=1).sum())
-            if turned:
-                notes.append(f"turned {turned} faces to a consistent winding")
-            faces = np.asarray(mesh.faces, np.int64)
-    body = bodies(faces)
-    count = int(body.max()) + 1
-    corners = vertices[faces] - vertices.mean(axis=0)
-    volume = np.bincount(body, np.linalg.det(corners) / 6.0, count)
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    np.minimum.at(low, body, corners.min(axis=1))
-    np.maximum.at(high, body, corners.max(axis=1))
-    flip = volume < -1e-9 * np.ptp(vertices, axis=0).max() ** 3
-    outermost = np.arange(count)
-    for k in range(count if flip.any() else 0):  # a body in another is turned as that is
-        about = np.flatnonzero(((low < low[k]) & (high > high[k])).all(axis=1))
-        point = corners[np.argmax(body == k), 0]
-        within = [o for o in about if abs(winding_number(corners[body == o], point)) > 0.5]
-        outermost[k] = max(within, key=lambda o: abs(volume[o]), default=k)
-    flip = flip[outermost]
-    if flip.any():
-        notes.append(f"turned {int(flip.sum())} of {count} bodies that were inside out")
-        faces = np.where(flip[body][:, None], faces[:, ::-1], faces)
-    return faces
 
 
 def _unite(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:

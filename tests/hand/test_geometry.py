@@ -5,7 +5,10 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 
-from lgrasp.hand.geometry import read_mesh, surface_samples
+from lgrasp.errors import HandError
+from lgrasp.geometry.mesh_files import one_file
+from lgrasp.hand.geometry import geometry_mesh, read_mesh, surface_samples
+from lgrasp.hand.urdf import read_urdf
 from lgrasp.judge.meshes import load_mesh
 
 SPACING = 0.004
@@ -55,3 +58,47 @@ def test_a_pointer_of_git_lfs_is_named(tmp_path, suffix):
     file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12345\n")
     with pytest.raises(ValueError, match="git lfs pull"):
         read_mesh(file)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".ply", ".glb"])
+def test_corners_with_several_textures_and_turned_faces_leave_a_link_as_it_is(tmp_path, suffix):
+    ball = trimesh.creation.icosphere(2, 0.01)
+    charts = np.array_split(np.argsort(ball.triangles_center[:, 2]), 2)
+    parts = [ball.submesh([chart], append=True) for chart in charts]
+    for part in parts:
+        part.visual = trimesh.visual.TextureVisuals(uv=part.vertices[:, :2])
+    seamed = trimesh.util.concatenate(parts)
+    inside_out = trimesh.Trimesh(ball.vertices, ball.faces[:, ::-1], process=False)
+    some = ball.faces.copy()
+    some[::3] = some[::3, ::-1]
+    for mesh in (seamed, inside_out, trimesh.Trimesh(ball.vertices, some, process=False)):
+        file = tmp_path / f"link{suffix}"
+        mesh.export(file)
+        found = read_mesh(file)
+        assert found.is_watertight
+        assert found.body_count == 1
+        assert found.volume == pytest.approx(ball.volume, rel=1e-4)
+
+
+def test_buffers_of_gltf_meshes_are_in_the_shard(tmp_path):
+    ball = trimesh.creation.icosphere(2, 0.01)
+    for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(ball)).items():
+        (tmp_path / ("tip.gltf" if name.endswith(".gltf") else name)).write_bytes(data)
+    assert list(tmp_path.glob("*.bin"))
+    (tmp_path / "alone.gltf").write_bytes(one_file(tmp_path / "tip.gltf"))
+    for file in tmp_path.glob("*.bin"):
+        file.unlink()
+    assert read_mesh(tmp_path / "alone.gltf").volume == pytest.approx(ball.volume, rel=1e-4)
+    assert load_mesh((tmp_path / "alone.gltf").read_bytes(), "tip.gltf").volume == pytest.approx(ball.volume, rel=1e-4)
+
+
+def test_a_mesh_scaled_twice_is_refused(tmp_path):
+    trimesh.creation.icosphere(2, 0.01).export(tmp_path / "tip.stl")
+    mesh = '<collision><geometry><mesh filename="tip.stl" scale="{0} {0} {0}"/></geometry></collision>'
+    joint = '<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>'
+    text = f'<robot name="r"><link name="a">{mesh}</link><link name="b"/>{joint}</robot>'
+    for scale, said in ((1e-3, "leave out the scale"), (1e3, "millimetres")):
+        (tmp_path / "r.urdf").write_text(text.format(scale))
+        urdf = read_urdf(tmp_path / "r.urdf")
+        with pytest.raises(HandError, match=said):
+            geometry_mesh(urdf, urdf.links["a"][0])

@@ -171,6 +171,11 @@ def test_urdf_with_the_names_of_a_known_hand(tmp_path):
     source = find_hand(str(path))
     assert source.known == ""
     assert "joints are up to 30 mm elsewhere" in source.note
+    shutil.copy(SHIPPED / "hand.urdf", path)
+    path.write_text(re.sub(r'(type="revolute">.*?rpy=")[^"]*', r"\1 0 3 0", path.read_text(), count=1, flags=re.DOTALL))
+    source = find_hand(str(path))
+    assert source.known == ""
+    assert "links are turned by up to 172°" in source.note
 
 
 @pytest.mark.skipif(

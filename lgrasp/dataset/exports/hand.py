@@ -10,10 +10,10 @@ import yourdfpy
 from lxml import etree
 
 from lgrasp.errors import ShardError
+from lgrasp.geometry.mesh_files import quiet_parsers
 from lgrasp.geometry.poses import compose, inverse, pose_from_matrix
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.urdf import parse_robot
-from lgrasp.object.load import quiet_parsers
 
 _LOG = "yourdfpy.urdf"  # which complains of joints that mimic one that mimics another
 
