@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lgrasp.choices import EngineName
 from lgrasp.cloud.read import Cloud
 from lgrasp.cloud.read import read_cloud as _read_cloud
 from lgrasp.cloud.suffixes import POINT_SUFFIXES
@@ -259,17 +260,19 @@ def simulate(
     grasps: Grasps | Name,
     protocol: str | Protocol = "fc",
     *,
+    engine: "EngineName | None" = None,
     all_directions: bool = False,
     device: "DeviceName" = "cpu",
     workers: int = 0,
     out: Name | None = None,
 ) -> Grasps:
-    """The same grasps with verdicts of MuJoCo in ``physics``, such as ``fc_holds``.
+    """The same grasps with verdicts of a simulator in ``physics``, such as ``fc_holds``.
 
     Args:
         grasps: grasps, a shard, or a folder of shards.
         protocol: dipgrasp, fc, fc_random, gravity6, gravity6_mu1, lift, seq6, seq6_mu06 or seq_shake; or a protocol
             with other numbers.
+        engine: mujoco, physx or drake; none: the protocol's own. Columns are ``physx_fc_holds`` then.
         all_directions: continue after a direction in which a grasp does not hold.
         out: folder for shards; none: no file.
 
@@ -279,7 +282,7 @@ def simulate(
     from lgrasp.jobs.simulate import SimulateJob
 
     found = find_protocol(protocol) if isinstance(protocol, str) else protocol
-    what: dict[str, Any] = {"workers": workers, "device": device, "all_directions": all_directions}
+    what: dict[str, Any] = {"workers": workers, "device": device, "all_directions": all_directions, "engine": engine}
     with _files(grasps) as files:
         return _done(SimulateJob, out, shards=files, protocol=found, **what)
 

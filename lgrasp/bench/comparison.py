@@ -191,7 +191,7 @@ def comparison_page(table: Table) -> Page:
     names = settings["pipelines"]
     baseline = f", {names[-1]} {settings['baseline_rows']:,}" if len(names) > 1 else ""
     what = f"strict-valid grasps per second, median of {settings['repeat']}"
-    notes = ["trimmed mean: without the highest and the lowest object"] if len(table["objects"]) > 1 else []
+    notes = ["trimmed mean: without the highest and the lowest object"] if len(table["objects"]) > 2 else []
     notes.append(
         "thread-seconds by stage; object s, field s: made from nothing, not part of the rates; load s: from the cache"
     )
@@ -214,7 +214,7 @@ def _hand_tables(table: Table, hand: str) -> list[Texts]:
     rows = [_rates(cell["object"], {n: _rate(cell, n) for n in names}, cell, published) for cell in cells]
     if len(cells) > 1:
         mean = next(mean for mean in table["means"] if mean["hand"] == hand)
-        rows.append(_rates("trimmed mean", mean["strict_valid_per_s"], mean, published))
+        rows.append(_rates("trimmed mean" if len(cells) > 2 else "mean", mean["strict_valid_per_s"], mean, published))
     runs = [(cell["object"], name, cell["pipelines"][name]) for cell in cells for name in names]
     stages = sorted({stage for *_, run in runs for stage in run["counts"]})
     details = [{"object": mesh, "pipeline": name} | _rows(run) for mesh, name, run in runs]

@@ -76,7 +76,11 @@ class ShardJob(ShardRequest, Job):
 
     def key_of(self, reader: ShardReader) -> str:
         """Content key of the job and of the rows of an open shard."""
-        return content_key("part", 1, job=self.key(), rows=rows_digest(reader))
+        return content_key("part", 1, job=self.key(), rows=self.digest(reader))
+
+    def digest(self, reader: ShardReader) -> str:
+        """:func:`rows_digest`, of further columns too where the job goes by them."""
+        return rows_digest(reader)
 
     def write(self, part: Part, contents: Any) -> None:
         """Write the file of a part: its source with more columns. Of several processes that add to one shard, each adds

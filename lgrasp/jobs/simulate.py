@@ -12,6 +12,7 @@ from pydantic import PrivateAttr
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
+from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import PhysicsError, ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.jobs.records import cutter
@@ -21,6 +22,7 @@ from lgrasp.jobs.verdicts import VerdictJob
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kept import Keeper
+from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.protocol import NO_TABLE, Protocol
 from lgrasp.simulate.run import check_installed, on_cpu, protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of
@@ -49,19 +51,34 @@ class SimulateJob(SimulateRequest, VerdictJob):
 
     def settings(self) -> dict[str, Any]:
         described = self.protocol.model_dump(mode="json")
-        return described | {"all_directions": self.all_directions, "device": self._kind()}
+        return described | {"all_directions": self._all, "device": self._kind()}
+
+    @property
+    def _all(self) -> bool:
+        """Whether all directions are asked for, of a protocol that has some."""
+        return self.all_directions and self.protocol.lift is None
 
     def told(self, protocol: dict[str, Any]) -> dict[str, Any]:
         device = "gpu" if str(protocol.get("simulator")).startswith("mujoco_warp") else "cpu"
         # what shards do not tell that were written before there was a choice
         older = {"engine": "mujoco", "draws": None, "lift": None, "shake": None}
-        return older | super().told(protocol) | {"device": device}
+        found = older | super().told(protocol) | {"device": device}
+        # all of them are more than is asked for, if not all are
+        return found | {"all_directions": bool(found.get("all_directions")) and self._all}
 
     def check_source(self, reader: ShardReader) -> None:
         super().check_source(reader)
         steered = reader.header.config.get("steered")
         if self.protocol.table and isinstance(steered, dict) and "above" in steered:
-            raise PhysicsError(f"{reader.path}: {NO_TABLE}")
+            raise ShardError(f"{reader.path}: {NO_TABLE}")
+        if self.protocol.lift:
+            try:
+                check_liftable(self.protocol, [record.tables for record in reader.objects()], reader.rows(0, 0))
+            except PhysicsError as error:
+                raise ShardError(f"{reader.path}: {error}") from None
+
+    def digest(self, reader: ShardReader) -> str:
+        return rows_digest(reader, ("table/pose", "table/approach") if self.protocol.table else ())
 
     def parts(self) -> list[Part]:
         check_installed(resolve_device(self.device).alias, self.protocol)
@@ -89,7 +106,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
                     protocol,
                     threads=workers,
                     progress=told,
-                    all_directions=self.all_directions,
+                    all_directions=self._all,
                     device=device,
                     keep=self._kept.get,
                     prepared=kept.prepared,
@@ -97,7 +114,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
                 kept.add(found, last=kept.rows + block == rows)
         added = {
             "physics": kept.columns,
-            "protocol": protocol_text(scene, protocol, all_directions=self.all_directions, device=device),
+            "protocol": protocol_text(scene, protocol, all_directions=self._all, device=device),
             "statistics": {
                 f"{name}_tried": rows,
                 f"{name}_held": kept.held,

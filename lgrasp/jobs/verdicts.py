@@ -9,7 +9,7 @@ from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part
 from lgrasp.engine.folder import Found
-from lgrasp.engine.shard_job import ShardJob, rows_digest
+from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import ShardError
 from lgrasp.jobs.difference import config_difference
 from lgrasp.jobs.requests.shards import VerdictRequest
@@ -50,7 +50,7 @@ class VerdictJob(VerdictRequest, ShardJob):
             text = self._protocol(reader)
             if text is None and self.in_place:
                 return None
-            rows, digest = len(reader), rows_digest(reader)
+            rows, digest = len(reader), self.digest(reader)
         job = content_key(self.command, self.version, settings=self._read(text or "{}"))
         return Found(content_key("part", 1, job=job, rows=digest), rows)
 

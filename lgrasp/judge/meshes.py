@@ -284,6 +284,8 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     if not mesh.area > 0.0:
         raise ValueError("a mesh has no area")
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
     if mesh.volume < 0:
         mesh.invert()
     return mesh

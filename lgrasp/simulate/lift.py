@@ -17,7 +17,6 @@ from lgrasp.errors import PhysicsError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.protocol import GRAVITY, FreeLift, Lift, Protocol, Shake
-from lgrasp.simulate.scene import Scene
 from lgrasp.simulate.verdict import AXES, Bounds, Look, Verdict, at_rest, chunk_of, moved
 from lgrasp.simulate.world import World
 
@@ -50,14 +49,14 @@ class Lifted(NamedTuple):
     diverged: bool = False
 
 
-def check_liftable(protocol: Protocol, scene: Scene, rows: GraspRows) -> None:
+def check_liftable(protocol: Protocol, tables: Sequence[np.ndarray | None], rows: GraspRows) -> None:
     """Raises PhysicsError unless each row has one object and, to lift it off a table, names a plane that this rests
-    on, and a way to it."""
+    on, of ``tables`` of all objects, and a way to it."""
     index, said, hint = np.asarray(rows.object_index), "", ""
     if protocol.table:
-        planes = [solid.tables for solid in scene.objects if solid.tables is not None]
+        planes = [planes for planes in tables if planes is not None]
         hint = "; lgrasp generate --table makes such"
-        if not {"pose", "approach"} <= set(rows.table) or len(planes) < len(scene.objects):
+        if not {"pose", "approach"} <= set(rows.table) or len(planes) < len(tables):
             said = "they do not say how the object lies on a table"
         elif any((rows.table["pose"][index[:, 0] == k] >= len(known)).any() for k, known in enumerate(planes)):
             said = "table/pose names a plane that the object does not have"

@@ -126,7 +126,7 @@ def verdicts(
     """
     _check_device(device, protocol)
     if protocol.lift:
-        check_liftable(protocol, scene, rows)
+        check_liftable(protocol, [solid.tables for solid in scene.objects], rows)
     slots = np.full(np.shape(rows.object_index), -1)
     found: dict[int, Verdict] = {}
     before = [0, 0]  # rows done and held

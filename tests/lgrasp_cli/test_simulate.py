@@ -179,6 +179,7 @@ def test_in_place(cli, grasps, tmp_path):
     assert "has other verdicts of fc (all_directions: False there, True requested); --overwrite replaces them" in line
     assert cli("simulate", grasps, "--all-directions", "--overwrite").code == 0
     assert (read_shard(second).grasps.physics["fc_directions"] >= 0).all()
+    assert json.loads(cli("simulate", grasps, "--json", "-").out)["made"] == 0  # all directions are more than is asked
     assert cli("dataset", "check", grasps).code == 0
     assert sorted(path.name for path in grasps.iterdir()) == [first.name, second.name, "manifest.json"]
 
@@ -389,8 +390,12 @@ def test_lift_needs_a_table(cli, grasps, tmp_path):
     pose[..., 2] = 0.078
     rows = replace(shard.grasps, object_pose=pose, table={"pose": np.zeros(1, "i4"), "approach": down})
     write_shard(path, replace(shard, objects=[replace(shard.objects[0], tables=plane)], grasps=rows))
-    for _ in range(2):  # the second time from what is there
-        result = cli("simulate", path, "-p", "lift", "--verbose", "--json", tmp_path / "report.json")
+    said = cli("simulate", grasps, "-p", "lift", "--out", tmp_path / "lifted")  # the other shard is without a table
+    assert said.code == 0, said
+    assert "left out" in said.err
+    assert [file.name for file in (tmp_path / "lifted").rglob("*.h5")] == [path.name]
+    for more in ((), ("--all-directions",)):  # which lift has none of: the second time from what is there
+        result = cli("simulate", path, "-p", "lift", "--verbose", "--json", tmp_path / "report.json", *more)
         assert result.code == 0, result
         assert result.out.splitlines()[1].split()[:4] == ["jaws", "cube", "1", "100.0%"]
     (entry,) = json.loads((tmp_path / "report.json").read_text())["results"]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.geometry.edges import face_normals
 from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.object.surface import sample_surface
+from lgrasp.object.surface import sample_surface, thin
 
 TOUCH_DISTANCE = 0.005
 """[m] from a contact to what it covers of the surface."""
@@ -175,9 +175,10 @@ class TouchedSurface:
     def __init__(self, record: ObjectRecord) -> None:
         vertices = np.asarray(record.vertices, float)
         if len(record.faces):
+            normals, areas = face_normals(vertices, record.faces)
             points, face = sample_surface(vertices, record.faces, _SURFACE_POINTS, seed=0)
-            self._points = points[:_SURFACE_POINTS]
-            self._normals = face_normals(vertices, record.faces)[0][face[:_SURFACE_POINTS]]
+            kept = thin(points, _SURFACE_POINTS, float(areas.sum()))
+            self._points, self._normals = points[kept], normals[face[kept]]
         else:
             chosen = slice(None, None, max(1, len(vertices) // _SURFACE_POINTS))
             self._points = vertices[chosen]

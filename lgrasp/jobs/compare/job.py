@@ -27,13 +27,14 @@ from lgrasp.hand.spec import load_spec
 from lgrasp.hand.workspace import WORKSPACE_VERSION, Workspace, measure_workspace
 from lgrasp.hold.params import HoldTest
 from lgrasp.jobs.compare.measure import measure_cell, measure_hand
-from lgrasp.jobs.compare.page import write_page
+from lgrasp.jobs.compare.page import WITHOUT_ROWS, write_page
 from lgrasp.jobs.config import pair_requests
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.metrics import HOLD, MetricsJob
 from lgrasp.jobs.requests.compare import CompareRequest, Variation, parse_variations
 from lgrasp.jobs.simulate import SimulateJob
+from lgrasp.notices import notice
 from lgrasp.object.find import all_objects
 from lgrasp.simulate.protocol import find_protocol
 
@@ -128,7 +129,8 @@ class CompareJob(CompareRequest, Job):
         Returns:
             ``hands``: of each ``hand``, ``of`` (the hand that it is a variant of), ``variation``, ``workspace`` (see
             :class:`~lgrasp.hand.workspace.Workspace`), ``objects`` (numbers by object, see
-            :func:`~lgrasp.jobs.compare.measure.measure_cell`) and ``all``; ``missing`` parts; ``page``.
+            :func:`~lgrasp.jobs.compare.measure.measure_cell`) and ``all``; ``missing`` parts; ``short``: ``hand``,
+            ``object`` and ``rows`` where these are fewer than asked; ``page``.
         """
         hands, files, missing = [], {}, 0
         parts = self.parts()
@@ -150,7 +152,16 @@ class CompareJob(CompareRequest, Job):
                     "all": measure_hand(objects, files[hand.name]),
                 }
             )
-        told = {"hands": hands, "missing": missing, "asked_rows": self.rows, "page": None}
+        short = [
+            {"hand": h["hand"], "object": name, "rows": cell["rows"]}
+            for h in hands
+            for name, cell in h["objects"].items()
+            if cell["rows"] < self.rows
+        ]
+        if short:
+            pairs = ", ".join(f"{s['hand']} with {s['object']} {s['rows']:,}" for s in short)
+            notice(f"fewer than {self.rows:,} grasps: {pairs}; {WITHOUT_ROWS}")
+        told = {"hands": hands, "missing": missing, "asked_rows": self.rows, "short": short, "page": None}
         data = told | {"pipeline": self.pairs[0][1].pipeline.name, "simulate": self.simulate}
         if hands:
             data["page"] = str(self.out / PAGE)

@@ -31,6 +31,8 @@ HAND_COLUMNS = (
 )
 """Numbers of a hand alone."""
 
+WITHOUT_ROWS = "contacts, epsilon, hold and simulated leave out objects without a grasp"
+
 
 def cells(found: Mapping[str, Any], columns: Sequence[tuple[str, str, float, str]]) -> list[str]:
     """Numbers as texts, ``-`` for None; of a PCA ratio the first, of an entropy the mean."""
@@ -65,8 +67,8 @@ def write_page(data: Mapping[str, Any], files: Mapping[str, Sequence[Path]], out
     alone = [head for _, head, _, _ in HAND_COLUMNS]
     rows = [[h["hand"], *cells(h["all"], columns), *cells(h["workspace"], HAND_COLUMNS)] for h in hands]
     words = (
-        f"Pipeline {data['pipeline']}, {data['asked_rows']:,} grasps of each hand with each object, "
-        f"on {data['device']}. Means over the objects; PCA and entropy of all rows together. "
+        f"Pipeline {data['pipeline']}, at most {data['asked_rows']:,} grasps of each hand with each object, "
+        f"on {data['device']}. Means over the objects; rows, PCA and entropy of all together; {WITHOUT_ROWS}. "
     )
     words += "; ".join(f"{name.replace('_', ' ')}: {what}" for name, what in MEANS.items() if name != "simulated")
     blocks: list[Block] = [
