@@ -9,7 +9,7 @@ import trimesh
 
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES
 from lgrasp.errors import CloudError, ShardError, short_reason
-from lgrasp.geometry.mesh_files import quiet_parsers
+from lgrasp.geometry.quiet import quiet_parsers
 from lgrasp.object.load import read_bytes
 
 SceneCloud = Callable[[Path], dict[str, np.ndarray]]

@@ -1,16 +1,10 @@
 """What a mesh file consists of: its own bytes, and the buffers in other files that a .gltf names."""
 
 import base64
-import contextlib
 import hashlib
 import json
-import logging
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import unquote
-
-import numpy as np
 
 _LFS_POINTER = b"version https://git-lfs"
 _STL_TEXT = 1000  # bytes in which the first face of a text begins
@@ -30,19 +24,6 @@ def check_whole(kind: str, data: bytes) -> None:
             raise ValueError(
                 f"{len(data):,} bytes for the {faces:,} faces of a binary STL; {84 + 50 * faces:,} are accepted"
             )
-
-
-@contextlib.contextmanager
-def quiet_parsers(logger: str = "trimesh") -> Iterator[None]:
-    """Keep the parsers of files from warning or logging: whatever matters is checked on their result."""
-    log = logging.getLogger(logger)
-    before, log.disabled = log.disabled, True
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        log.disabled = before
 
 
 def mesh_bytes(path: Path, data: bytes | None = None) -> dict[str, bytes]:

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.edges import bodies, open_edges, winding_number
-from lgrasp.geometry.mesh_files import quiet_parsers
+from lgrasp.geometry.quiet import quiet_parsers
 
 
 def outward(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:

@@ -17,8 +17,9 @@ from trimesh.resolvers import FilePathResolver
 
 from lgrasp.errors import LgraspError, ObjectError, short_reason
 from lgrasp.geometry.edges import bodies, open_edges
-from lgrasp.geometry.mesh_files import check_whole, mesh_bytes, mesh_digest, quiet_parsers
+from lgrasp.geometry.mesh_files import check_whole, mesh_bytes, mesh_digest
 from lgrasp.geometry.obj_file import RawMesh, read_obj
+from lgrasp.geometry.quiet import quiet_parsers
 from lgrasp.geometry.winding import outward
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.mass import united_bodies

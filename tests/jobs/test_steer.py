@@ -14,7 +14,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.run import run as generate
 from lgrasp.engine.run import run as run_job
 from lgrasp.engine.shard import shard_context
-from lgrasp.errors import ConfigError, PhysicsError
+from lgrasp.errors import ConfigError, ShardError
 from lgrasp.geometry.poses import device_matrix, pose_matrix
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.config import JobConfig, plan_requests
@@ -234,7 +234,7 @@ def test_a_steering_without_poses_ends_early(job, swift, tmp_path, monkeypatch):
 def test_a_plane_is_no_table_to_lift_from(steered, job, swift, tmp_path):
     _, path = steered(rows=2, above="0,0,1,0.001")
     given = {"shards": (path.parent,), "protocol": "lift", "out": tmp_path / "lifted"}
-    with pytest.raises(PhysicsError, match=r"allegro-mug-00000\.h5: the plane of --above .* generate --table"):
+    with pytest.raises(ShardError, match=r"allegro-mug-00000\.h5: the plane of --above .* generate --table"):
         run_job(parse_model(SimulateJob, given, "simulate"))
     lifted = swift.with_simulation("lift")
     with pytest.raises(ConfigError, match="stage simulate: the plane of --above"):

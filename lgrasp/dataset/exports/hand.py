@@ -10,8 +10,8 @@ import yourdfpy
 from lxml import etree
 
 from lgrasp.errors import ShardError
-from lgrasp.geometry.mesh_files import quiet_parsers
 from lgrasp.geometry.poses import compose, inverse, pose_from_matrix
+from lgrasp.geometry.quiet import quiet_parsers
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.urdf import parse_robot
 
