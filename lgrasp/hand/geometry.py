@@ -55,7 +55,7 @@ def geometry_mesh(urdf: Urdf, geometry: Geometry) -> trimesh.Trimesh:
             mesh = read_mesh(file)
     except Exception as error:  # any parser error means the same to the user
         raise HandError(f"URDF {urdf.path}: mesh {file} cannot be read: {short_reason(error)}") from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+    if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         raise HandError(f"URDF {urdf.path}: mesh {file} has no usable triangles")
     mesh = thin_mesh(mesh, MOST_FACES)
     mesh.apply_scale(geometry.size)
@@ -85,13 +85,13 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
         raw = read_obj(data)
         vertices, faces = raw.vertices, raw.faces
     else:
-        mesh = trimesh.load_mesh(file, process=True)
+        mesh = trimesh.load_mesh(file, process=False)
         unit = unit_conversion(mesh.units, "meters") if kind == "dae" and mesh.units else 1.0
         vertices, faces = mesh.vertices * unit, mesh.faces
     # colours and textures keep corners apart that are one
     mesh = trimesh.Trimesh(vertices, faces, process=True)
-    turned: list[str] = []
-    mesh.faces = outward(mesh.vertices, mesh.faces, turned) if len(mesh.faces) else mesh.faces
+    if len(mesh.faces):
+        mesh.faces = outward(mesh.vertices, mesh.faces, [])
     return mesh
 
 

@@ -288,7 +288,7 @@ def _rewritten(file: Path, *, huge: bool) -> trimesh.Trimesh | None:
         mesh = read_mesh(file)
     except Exception:
         return None
-    return mesh if isinstance(mesh, trimesh.Trimesh) and (several or len(mesh.faces) > MOST_FACES) else None
+    return mesh if several or len(mesh.faces) > MOST_FACES else None
 
 
 def drafted_folder(urdf: Path, name: str) -> Path:
