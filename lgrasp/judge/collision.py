@@ -125,7 +125,7 @@ def hand_in_object(hand: JudgedHand, obj: JudgedObject, T_object_links: np.ndarr
     for solid in hand.solids:
         T = T_object_links[:, solid.link]
         centre = T[:, :3, :3] @ solid.centre + T[:, :3, 3]
-        crosses = obj.surface.closest(centre)[0] <= solid.radius + 1e-6
+        crosses = obj.surface.within(centre, solid.radius + 1e-6)
         near = np.flatnonzero(crosses)
         for rows in np.array_split(near, max(1, len(near) // 64)):
             lists = obj.tree.query_ball_point(centre[rows], solid.radius + 1e-9)

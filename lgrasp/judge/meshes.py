@@ -207,6 +207,15 @@ class MeshDistance:
         """Signed distance (n,) of points (n, 3), negative inside."""
         return np.where(self.contains(points), -1.0, 1.0) * self.closest(points)[0]
 
+    def within(self, points: np.ndarray, reach: float) -> np.ndarray:
+        """Which of the points (n, 3) are within ``reach`` [m] of the surface."""
+        gap = np.maximum(np.maximum(self.low - points, points - self.high), 0.0)
+        out = np.linalg.norm(gap, axis=1) <= reach
+        rows = np.flatnonzero(out)
+        unsure = rows[self.guess.query(points[rows])[0] > reach]
+        out[unsure] = self.closest(points[unsure])[0] <= reach
+        return out
+
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which of the points (n, 3) are inside."""
         out = np.all((points > self.low) & (points < self.high), axis=1)

@@ -93,7 +93,7 @@ class PlanParams(Params):
         "the one that holds most often is the plan. 0: none; default: 8 of those that a network draws, 16 for "
         "more than three fingers and a cloud of one side, else 10.",
     )
-    hold: HoldTest = Field(default=HoldTest(), description="How they are tried.")
+    hold: HoldTest = Field(default=HoldTest(draws=8), description="How they are tried.")
     min_hold_probability: float | None = Field(
         default=None,
         ge=0,

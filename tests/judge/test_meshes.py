@@ -54,6 +54,8 @@ def test_signed_distance_of_a_box(count):
     surface = MeshDistance(trimesh.creation.box((2, 1, 3)))
     np.testing.assert_allclose(surface.signed(points), exact, atol=1e-12)
     np.testing.assert_allclose(surface.depth(points), np.maximum(-exact, 0.0), atol=1e-12)
+    for reach in (0.05, 0.3, 2.0):
+        assert (surface.within(points, reach) == (np.abs(exact) <= reach)).all()
 
 
 def test_bad_meshes_are_refused():
