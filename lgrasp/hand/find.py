@@ -1,6 +1,6 @@
 """From the user's name of a hand to its URDF file and rules."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,36 +74,50 @@ def _from_folder(folder: Path, urdf: Path | None = None, note: str = "") -> Hand
 
 
 def rules_of_known(path: Path) -> HandSource | None:
-    """The URDF, called as its file, with the rules of the known hand whose joint and link names all occur in it."""
+    """The URDF, called as its file, with the rules of the known hand whose joint and link names all occur in it; of
+    several of the one whose joints are nearest, if not turned."""
     urdf = read_urdf(path)
     movable = {j.name: j for j in urdf.joints if j.movable}
+    alike = list(_known_alike(urdf, set(movable)))
+    if not alike:
+        return None
+
+    def far(known: tuple[HandSource, Urdf]) -> tuple[bool, float]:
+        away, turned = _joints_away(urdf, known[1])
+        return turned > _SAME_FRAME, away
+
+    source, own = min(alike, key=far)
+    stated = {name for name, joint in movable.items() if joint.mimic is not None}
+    mimic = {j.name: j.mimic for j in own.joints if j.mimic is not None and j.name not in stated}
+    missing = {n: Coupling(joint=j, multiplier=m, offset=b) for n, (j, m, b) in mimic.items()}
+    note = f"rules (contacts, canonical box, open posture) of the known hand '{source.name}', whose joints and "
+    note += "links have the same names"
+    if missing:
+        note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
+    (away, turned), name = _joints_away(urdf, own), name_of_file(path, urdf.name)
+    if turned > _SAME_FRAME:  # contacts are told in the frames of links
+        note += f"; but links are turned by up to {np.degrees(turned):.0f}° against them"
+    if away > _SAME_SHAPE:
+        note += f"; but joints are up to {1e3 * away:.0f} mm elsewhere"
+    if other := turned > _SAME_FRAME or away > _SAME_SHAPE:
+        note += ": 'lgrasp hands add' drafts rules for them"
+    added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
+    spec, left_out = _without_misfits(
+        urdf, source.spec.model_copy(update={"mimic": added | missing, "approximation": "", "name": name})
+    )
+    return HandSource(name, path, spec, note + left_out, "" if other else source.name)
+
+
+def _known_alike(urdf: Urdf, movable: set[str]) -> Iterator[tuple[HandSource, Urdf]]:
+    """Known hands that have the same movable joints and no other links."""
     for folder in known_hands().values():
         try:
             source = _from_folder(folder)
             own = read_urdf(source.urdf)
         except HandError:  # a broken hand elsewhere on the search path is not this hand
             continue
-        if {j.name for j in own.joints if j.movable} == set(movable) and set(own.links) <= set(urdf.links):
-            stated = {name for name, joint in movable.items() if joint.mimic is not None}
-            mimic = {j.name: j.mimic for j in own.joints if j.mimic is not None and j.name not in stated}
-            missing = {n: Coupling(joint=j, multiplier=m, offset=b) for n, (j, m, b) in mimic.items()}
-            note = f"rules (contacts, canonical box, open posture) of the known hand '{source.name}', whose joints and "
-            note += "links have the same names"
-            if missing:
-                note += f", and its couplings of {', '.join(missing)}, which this URDF does not state"
-            (away, turned), name = _joints_away(urdf, own), name_of_file(path, urdf.name)
-            if turned > _SAME_FRAME:  # contacts are told in the frames of links
-                note += f"; but links are turned by up to {np.degrees(turned):.0f}° against them"
-            if away > _SAME_SHAPE:
-                note += f"; but joints are up to {1e3 * away:.0f} mm elsewhere"
-            if other := turned > _SAME_FRAME or away > _SAME_SHAPE:
-                note += ": 'lgrasp hands add' drafts rules for them"
-            added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
-            spec, left_out = _without_misfits(
-                urdf, source.spec.model_copy(update={"mimic": added | missing, "approximation": "", "name": name})
-            )
-            return HandSource(name, path, spec, note + left_out, "" if other else source.name)
-    return None
+        if {j.name for j in own.joints if j.movable} == movable and set(own.links) <= set(urdf.links):
+            yield source, own
 
 
 def _joints_away(urdf: Urdf, known: Urdf) -> tuple[float, float]:

@@ -178,6 +178,17 @@ def test_urdf_with_the_names_of_a_known_hand(tmp_path):
     assert "links are turned by up to 172°" in source.note
 
 
+def test_nearest_of_the_known_hands_with_its_names(library, tmp_path):
+    """A hand of the user's own comes first on the search path, but has its joints elsewhere, or turned."""
+    path, own = tmp_path / "copy.urdf", library / "hand.urdf"
+    shutil.copy(SHIPPED / "hand.urdf", path)
+    own.write_text(own.read_text().replace('xyz="0 0 0.054"', 'xyz="0 0 0.056"'))
+    assert find_hand(str(path)).known == "allegro"
+    own.write_text(re.sub(r'(type="revolute">.*?rpy=")[^"]*', r"\1 0 3 0", path.read_text(), count=1, flags=re.DOTALL))
+    path.write_text(path.read_text().replace('xyz="0 0 0.054"', 'xyz="0 0 0.056"'))
+    assert find_hand(str(path)).known == "allegro"
+
+
 @pytest.mark.skipif(
     not (REAL / "allegro" / "allegro.urdf").is_file(), reason="the real Allegro is not at ../shared/assets/hands"
 )
