@@ -3,7 +3,6 @@
 import json
 import re
 
-import numpy as np
 import pytest
 import trimesh
 from support.places import QUICK
@@ -55,8 +54,9 @@ def test_numbers_are_those_of_the_shards(compared):
         cell = hand["objects"]["sphere"]
         with ShardReader(path) as reader:
             assert cell["rows"] == len(reader) == ROWS
+            assert cell["hold"] > 0
             assert cell["hold"] == pytest.approx(reader.column("metrics/hold_success").mean())
-            assert cell["epsilon"] == pytest.approx(float(np.median(reader.column("metrics/epsilon"))))
+            assert cell["epsilon"] == pytest.approx(float(reader.column("metrics/epsilon").mean()), rel=1e-5)
             kept, tried = (float(reader.statistics[name]) for name in ("filter_kept", "candidates"))
             assert cell["yield"] == pytest.approx(kept / tried)  # all rows are strict
         assert 0 < cell["surface"] < 1

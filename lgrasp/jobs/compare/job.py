@@ -39,6 +39,7 @@ from lgrasp.object.find import all_objects
 from lgrasp.simulate.protocol import find_protocol
 
 _VERSION = 1  # of variants
+_TEST = HoldTest(draws=0)  # the trial with the numbers of fc is compared
 
 
 class ComparedHand(NamedTuple):
@@ -106,7 +107,7 @@ class CompareJob(CompareRequest, Job):
     def part_key(self, part: Part) -> str:
         job = self.pairs[part.number][1]
         return content_key(
-            "compared", 1, grasps=job.key(), rows=self.rows, hold=HoldTest().model_dump(mode="json"), by=self.simulate
+            "compared", 1, grasps=job.key(), rows=self.rows, hold=_TEST.model_dump(mode="json"), by=self.simulate
         )
 
     def parts(self) -> list[Part]:
@@ -195,7 +196,8 @@ def make_cell(job: GenerateJob, protocol: ProtocolName | None, key: str, progres
     with temporary_folder() as folder:
         _run(job.changed(out=folder / "grasps"), told)
         told.what = "hold test"
-        tried = MetricsJob(shards=(folder / "grasps",), out=folder / "tried", add=(HOLD,), **how)
+        draws = (f"hold.draws={_TEST.draws}",)
+        tried = MetricsJob(shards=(folder / "grasps",), out=folder / "tried", add=(HOLD,), settings=draws, **how)
         (path,) = _run(tried, told)
         if protocol is not None:
             told.what, how["device"] = protocol, "cpu"

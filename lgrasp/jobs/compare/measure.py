@@ -5,8 +5,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-import numpy as np
-
 from lgrasp.choices import ProtocolName
 from lgrasp.dataset.info import last_survivors, stage_counts
 from lgrasp.dataset.reader import ShardReader
@@ -19,8 +17,8 @@ MEANS = {
     "approach": "share of approach directions",
     "surface": "share of the surface within 5 mm of a contact",
     "contacts": "mean contacts of a row",
-    "epsilon": "median",
-    "unresisted_load": "median",
+    "epsilon": "mean of the rows",
+    "unresisted_load": "mean of the rows",
     "hold": "share that stays in the hold test",
     "simulated": "share that holds in the simulation",
 }
@@ -50,7 +48,7 @@ def measure_cell(path: Path, protocol: ProtocolName | None) -> dict[str, Any]:
         if not rows:
             return found
         for name in ("epsilon", "unresisted_load"):
-            found[name] = float(np.median(reader.column(f"metrics/{name}").astype(float)))
+            found[name] = float(reader.column(f"metrics/{name}").astype(float).mean())
         found["hold"] = float(reader.column("metrics/hold_success").astype(float).mean())
         if protocol and (held := f"physics/{protocol}_holds") in reader.columns:
             found["simulated"] = float((reader.column(held) > 0).mean())
