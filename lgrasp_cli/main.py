@@ -92,7 +92,7 @@ def main() -> None:
     reads what it prints."""
     on_notice(warn)
     sys.argv[1:] = renew(sys.argv[1:], options_of(program(), sys.argv[1:]))
-    if os.environ.get("LGRASP_DEBUG"):
+    if os.environ.get("LGRASP_DEBUG", "0") not in ("", "0"):
         sys.exit(_exit_code())
     try:
         code = _exit_code()

@@ -192,7 +192,7 @@ def interruptible(progress: JobProgress) -> Iterator[JobProgress]:
         if again or not progress.running:
             stop_now()
         progress.stop = True
-        tell("stopping after the current batch; press Ctrl-C again to stop at once")
+        tell("stopping; what is being made is dropped; press Ctrl-C again to stop at once")
 
     with on_interrupt(stop):
         yield progress

@@ -85,7 +85,11 @@ def _profile(data: dict[str, Any]) -> list[Block]:
     if lift is None:
         title, ways, at = f"{title} run in a direction", DIRECTIONS, ("at q", "at grasp")
     elif "way" in lift:
-        title, ways, at = f"{title}; how far the coming hand pushed, median", ("on table", "pushed"), ("at q",)
+        title, ways, at = (
+            f"{title}; how far the object moved as the hand came, median",
+            ("on table", "pushed"),
+            ("at q",),
+        )
     else:
         ways, at = (), ("at q",)
     names = ("hand", "object", *ways, *at, "mass", "stiffness")

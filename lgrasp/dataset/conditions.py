@@ -37,10 +37,12 @@ class Condition(NamedTuple):
         """
         single = [OBJECTS_HELD, *(name for name, (shape, _) in reader.columns.items() if len(shape) == 1)]
         if self.column not in single:
+            known = f"with one number per row it has {', '.join(single)}"
+            if self.column in reader.columns:
+                raise ShardError(f"{reader.path}: column {self.column!r} has several numbers per row; {known}")
             maker = "reach" if self.column.startswith("physics/reach_") else "simulate"
             hint = f" (lgrasp {maker} adds physics columns)" if self.column.startswith("physics/") else ""
-            known = ", ".join(single)
-            raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; with one number per row it has {known}")
+            raise ShardError(f"{reader.path}: no column {self.column!r}{hint}; {known}")
         held = self.column == OBJECTS_HELD
         values = (reader.column("object_index") >= 0).sum(1) if held else reader.column(self.column)
         return _OPERATORS[self.operator](values, self.value) & ~np.isnan(values.astype(np.float64))

@@ -31,7 +31,8 @@ def try_rows(
 ) -> dict[str, np.ndarray]:
     """The metrics of rows of one object (:data:`~lgrasp.hold.run.METRICS`), each (N,) float32.
 
-    They are those of stage hold, with the same draws; none depends on the other rows.
+    They are those of stage hold, with the same draws, but where a draw ends at the limit: the stage tries poses before
+    they are rounded to be stored. None depends on the other rows.
 
     Args:
         hand, obj: on one device.

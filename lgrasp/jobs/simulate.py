@@ -297,7 +297,7 @@ class KeptVerdicts:
     def next_block(self, rows: int, threads: int) -> int:
         """Rows to simulate next, of so many in all."""
         rate = self.rows / self.seconds if self.seconds else 0.0
-        size = self._largest or max(int(rate * _BLOCK_SECONDS), _FIRST * threads)
+        size = self._largest or (max(int(rate * _BLOCK_SECONDS), threads) if rate else _FIRST * threads)
         self._begin, self._prepared = time.perf_counter(), 0.0
         return min(size, rows - self.rows)
 

@@ -113,14 +113,13 @@ class Report(JudgedRows):
 
     @property
     def by_objects(self) -> dict[int, dict[str, float]]:
-        """By number of objects held: rows, valid ones, and of these the penetration of hand and objects [mm]."""
+        """By number of objects held: rows, valid ones, and the penetration of hand and objects [mm] of all."""
         out: dict[int, dict[str, float]] = {}
         for held in np.unique(self.held):
             mask = self.held == held
-            good = mask & self.valid
-            out[int(held)] = {"rows": int(mask.sum()), "valid": int(good.sum())}
+            out[int(held)] = {"rows": int(mask.sum()), "valid": int((mask & self.valid).sum())}
             for name, key in (("hand", "penetration_mm"), ("objects", "object_object_mm")):
-                found = _spread({"": self.values[key][good]}).get("", {})
+                found = _spread({"": self.values[key][mask]}).get("", {})
                 out[int(held)] |= {f"{name} {k}": found.get(k, math.nan) for k in ("max", "p50")}
         return out
 

@@ -52,18 +52,18 @@ class Lifted(NamedTuple):
 def check_liftable(protocol: Protocol, tables: Sequence[np.ndarray | None], rows: GraspRows) -> None:
     """Raises PhysicsError unless each row has one object and, to lift it off a table, names a plane that this rests
     on, of ``tables`` of all objects, and a way to it."""
-    index, said, hint = np.asarray(rows.object_index), "", ""
-    if protocol.table:
-        planes = [planes for planes in tables if planes is not None]
-        hint = "; lgrasp generate --table makes such"
-        if not {"pose", "approach"} <= set(rows.table) or len(planes) < len(tables):
-            said = "they do not say how the object lies on a table"
-        elif any((rows.table["pose"][index[:, 0] == k] >= len(known)).any() for k, known in enumerate(planes)):
-            said = "table/pose names a plane that the object does not have"
+    index, said = np.asarray(rows.object_index), ""
     if index.shape[1] != 1:
         said = "they have several objects"
+    elif protocol.table:
+        planes = [planes for planes in tables if planes is not None]
+        hint = "lgrasp generate --table makes such"
+        if not {"pose", "approach"} <= set(rows.table) or len(planes) < len(tables):
+            said = f"they do not say how the object lies on a table; {hint}"
+        elif any((rows.table["pose"][index[:, 0] == k] >= len(known)).any() for k, known in enumerate(planes)):
+            said = f"table/pose names a plane that the object does not have; {hint}"
     if said:
-        raise PhysicsError(f"protocol {protocol.name} cannot simulate these grasps: {said}{hint}")
+        raise PhysicsError(f"protocol {protocol.name} cannot simulate these grasps: {said}")
 
 
 def course_of(

@@ -270,6 +270,7 @@ def test_sequences(tmp_path: Path) -> None:
     assert found[:2] == [set(), set()]
     assert dict(zip(cases, found[2:], strict=True)) == {name: wanted for name, (_, wanted) in cases.items()}
     assert {k: (d["rows"], d["valid"]) for k, d in report.by_objects.items()} == {1: (1, 1), 2: (14, 1)}
+    assert report.by_objects[2]["objects max"] == pytest.approx(np.nanmax(report.values["object_object_mm"]))
     assert report.values["object_object_mm"][4] == pytest.approx(3.0, abs=1e-3)
     assert "objects held" in str(report)
     assert set().union(*found) >= OF_SEVERAL

@@ -25,7 +25,7 @@ from lgrasp.hand.drafting.mjcf import mjcf_to_urdf
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.geometry import MOST_FACES, read_mesh, thin_mesh
-from lgrasp.hand.names import name_of_file, slug
+from lgrasp.hand.names import known_hands, name_of_file, slug
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
 from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, read_robot
 from lgrasp.paths import cache_dir, data_dirs, user_dir
@@ -85,6 +85,10 @@ def import_urdf(
         if os.path.lexists(folder) and not force:
             raise HandError(
                 f"hand folder {folder} exists; choose another --name or --out, or replace it with --overwrite"
+            )
+        if out is None and not force and name in known_hands():
+            raise HandError(
+                f"hand '{name}' comes with lgrasp; choose another --name, or hide that one with --overwrite"
             )
         no_hand = folder.exists() and not (folder / "hand.yaml").is_file()
         if no_hand and not (folder.is_dir() and next(folder.iterdir(), None) is None):

@@ -70,7 +70,7 @@ def write_page(data: Mapping[str, Any], files: Mapping[str, Sequence[Path]], out
         f"Pipeline {data['pipeline']}, at most {data['asked_rows']:,} grasps of each hand with each object, "
         f"on {data['device']}. Means over the objects; rows, PCA and entropy of all together; {WITHOUT_ROWS}. "
     )
-    words += "; ".join(f"{name.replace('_', ' ')}: {what}" for name, what in MEANS.items() if name != "simulated")
+    words += "; ".join(f"{head}: {MEANS[name]}" for name, head, _, _ in columns if name in MEANS)
     blocks: list[Block] = [
         {"words": f"{words}. docs/guides/compare-hands.md explains the rest.", "kind": "dim"},
         chapter("All objects", 2),

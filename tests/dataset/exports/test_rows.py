@@ -192,7 +192,7 @@ def test_bad_input_leaves_nothing(tmp_path, shards):
             "out",
             {"where": ["q > 1"]},
             ShardError,
-            "no column 'q'; with one number per row it has objects, candidate, metrics/epsilon",
+            "column 'q' has several numbers per row; with one number per row it has objects, candidate, ",
         ),
         ("a.h5", "out", {"where": ["metrics/epsilon > 2"]}, ShardError, "none satisfies metrics/epsilon > 2"),
         ("c.h5", "out", {}, ShardError, "no such file"),

@@ -192,6 +192,13 @@ def test_huge_mesh_is_thinned_and_keeps_its_shape(tmp_path, monkeypatch):
     assert np.abs(np.linalg.norm(thin.vertices, axis=1) - 0.012).max() < 5e-5
 
 
+def test_shipped_hands_are_not_hidden_unasked(tmp_path, monkeypatch):
+    monkeypatch.setattr("lgrasp.hand.drafting.import_urdf.user_dir", lambda kind: tmp_path / kind)
+    with pytest.raises(HandError, match=r"'allegro' comes with lgrasp; .*--name.*--overwrite"):
+        import_urdf(gripper(tmp_path), name="allegro")
+    assert not (tmp_path / "hands").exists()
+
+
 @pytest.mark.usefixtures("no_spaces")
 def test_folder_is_whole_or_absent(tmp_path):
     path, folder = gripper(tmp_path), tmp_path / "hands" / "jaws"
