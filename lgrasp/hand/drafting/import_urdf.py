@@ -86,10 +86,8 @@ def import_urdf(
             raise HandError(
                 f"hand folder {folder} exists; choose another --name or --out, or replace it with --overwrite"
             )
-        if out is None and not force and name in known_hands():
-            raise HandError(
-                f"hand '{name}' comes with lgrasp; choose another --name, or hide that one with --overwrite"
-            )
+        if out is None and not force and (known := known_hands().get(name)):
+            raise HandError(f"hand '{name}' is in {known}; choose another --name, or hide that one with --overwrite")
         no_hand = folder.exists() and not (folder / "hand.yaml").is_file()
         if no_hand and not (folder.is_dir() and next(folder.iterdir(), None) is None):
             raise HandError(f"{folder} holds something that is no hand (it has no hand.yaml); choose another --out")

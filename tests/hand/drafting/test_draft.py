@@ -194,7 +194,7 @@ def test_huge_mesh_is_thinned_and_keeps_its_shape(tmp_path, monkeypatch):
 
 def test_shipped_hands_are_not_hidden_unasked(tmp_path, monkeypatch):
     monkeypatch.setattr("lgrasp.hand.drafting.import_urdf.user_dir", lambda kind: tmp_path / kind)
-    with pytest.raises(HandError, match=r"'allegro' comes with lgrasp; .*--name.*--overwrite"):
+    with pytest.raises(HandError, match=rf"'allegro' is in {ALLEGRO.parent}; .*--name.*--overwrite"):
         import_urdf(gripper(tmp_path), name="allegro")
     assert not (tmp_path / "hands").exists()
 
