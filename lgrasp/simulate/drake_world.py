@@ -6,7 +6,7 @@ import numpy as np
 
 from lgrasp.errors import PhysicsError, short_reason
 from lgrasp.runtime.optional import import_mujoco, import_optional
-from lgrasp.simulate.model import Model, effort_limit, leaders, pairs_apart
+from lgrasp.simulate.model import Model, drive_gains, effort_limit, leaders, mesh_corners, pairs_apart
 from lgrasp.simulate.verdict import WILD
 from lgrasp.simulate.world import World
 
@@ -129,10 +129,6 @@ class DrakeWorld(World):
         found = [self._plant.EvalBodySpatialVelocityInWorld(self._context, body) for body in self._objects]
         return np.array([[*motion.translational(), *motion.rotational()] for motion in found])
 
-    def hand_joints(self) -> np.ndarray:
-        q = self._plant.GetPositions(self._context)
-        return q[[joint.position_start() for joint in self._joints.values()]]
-
     def frames(self) -> tuple[np.ndarray, np.ndarray]:
         poses = [self._plant.EvalBodyPoseInWorld(self._context, body) for body in self._bodies]
         return np.array([p.translation() for p in poses]), np.array([p.rotation().matrix() for p in poses])
@@ -220,10 +216,7 @@ class DrakeWorld(World):
         shapes, kinds, m = self._drake.geometry, self._mujoco.mjtGeom, self._m
         kind, size = m.geom_type[geom], m.geom_size[geom]
         if kind == kinds.mjGEOM_MESH:
-            mesh = int(m.geom_dataid[geom])
-            first = int(m.mesh_vertadr[mesh])
-            vertices = m.mesh_vert[first : first + int(m.mesh_vertnum[mesh])]
-            return shapes.Convex(points=vertices.T.astype(float), label=str(geom))
+            return shapes.Convex(points=mesh_corners(m, geom).T.astype(float), label=str(geom))
         if kind == kinds.mjGEOM_SPHERE:
             return shapes.Sphere(float(size[0]))
         if kind == kinds.mjGEOM_BOX:
@@ -273,9 +266,8 @@ class DrakeWorld(World):
             actuator = self._plant.AddJointActuator(f"drive {j}", joint, effort_limit(m, j))
             actuator.set_default_rotor_inertia(float(m.dof_armature[m.jnt_dofadr[j]]))
             if j in driven:
-                gain, damping = m.actuator_gainprm[driven[j], 0], -m.actuator_biasprm[driven[j], 2]
-                gains = self._drake.multibody.tree.PdControllerGains(p=float(gain), d=float(damping))
-                actuator.set_controller_gains(gains)
+                gain, damping = drive_gains(m, driven[j])
+                actuator.set_controller_gains(self._drake.multibody.tree.PdControllerGains(p=gain, d=damping))
             if leader != j:
                 self._plant.AddCouplerConstraint(joint, self._joints[leader], factor, offset)
 

@@ -166,6 +166,18 @@ def effort_limit(model: Any, joint: int) -> float:
     return float(model.jnt_actfrcrange[joint, 1]) if model.jnt_actfrclimited[joint] else np.inf
 
 
+def drive_gains(model: Any, drive: int) -> tuple[float, float]:
+    """Stiffness [N m/rad or N/m] and damping of a drive of an MjModel."""
+    return float(model.actuator_gainprm[drive, 0]), float(-model.actuator_biasprm[drive, 2])
+
+
+def mesh_corners(model: Any, geom: int) -> np.ndarray:
+    """Vertices of a geom of an MjModel that is a mesh (V, 3) [m]."""
+    mesh = int(model.geom_dataid[geom])
+    first = int(model.mesh_vertadr[mesh])
+    return model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+
+
 def pairs_apart(model: Any) -> list[tuple[int, int]]:
     """Bodies that an MjModel has never collide: neighbours, and those that always touch."""
     return [divmod(int(signature), 1 << 16) for signature in model.exclude_signature]

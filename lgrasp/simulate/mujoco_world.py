@@ -77,9 +77,6 @@ class MujocoWorld(World):
     def velocities(self) -> np.ndarray:
         return self.data.qvel[self._model.object_velocity]
 
-    def hand_joints(self) -> np.ndarray:
-        return self.data.qpos[self._model.joint_address]
-
     def frames(self) -> tuple[np.ndarray, np.ndarray]:
         self._lib.mj_kinematics(self._m, self.data)
         return self.data.xpos, self.data.xmat.reshape(-1, 3, 3)

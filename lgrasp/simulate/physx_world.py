@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lgrasp.errors import PhysicsError
 from lgrasp.runtime.optional import import_mujoco, import_optional
-from lgrasp.simulate.model import Model, effort_limit, leaders, pairs_apart
+from lgrasp.simulate.model import Model, drive_gains, effort_limit, leaders, mesh_corners, pairs_apart
 from lgrasp.simulate.verdict import WILD
 from lgrasp.simulate.world import World
 
@@ -162,7 +162,7 @@ class PhysxWorld(World):
 
     def _within_effort(self, c: _Coupled, at: float, rate: float) -> float:
         """The target of a drive, or the one at which it presses with its effort limit, at a position and speed."""
-        target, (gain, damping) = float(self._targets[c.drive]), self._gains(c.drive)
+        target, (gain, damping) = float(self._targets[c.drive]), drive_gains(self._m, c.drive)
         effort = gain * (target - at) - damping * rate
         if abs(effort) <= c.limit:
             return target
@@ -184,9 +184,6 @@ class PhysxWorld(World):
     def velocities(self) -> np.ndarray:
         found = [[*c.get_linear_velocity(), *c.get_angular_velocity()] for c in self._objects]
         return np.array(found, float)
-
-    def hand_joints(self) -> np.ndarray:
-        return np.asarray(self._hand.get_qpos(), float)[self._column]
 
     def frames(self) -> tuple[np.ndarray, np.ndarray]:
         at, turn = np.zeros((self._m.nbody, 3)), np.tile(np.eye(3), (self._m.nbody, 1, 1))
@@ -313,7 +310,7 @@ class PhysxWorld(World):
         joint.set_friction(0.0)
         driven = np.flatnonzero(m.actuator_trnid[:, 0] == j)
         if len(driven):
-            joint.set_drive_property(*self._gains(int(driven[0])), min(effort_limit(m, j), _NO_LIMIT))
+            joint.set_drive_property(*drive_gains(m, int(driven[0])), min(effort_limit(m, j), _NO_LIMIT))
 
     def _add_shapes(self, body: int, component: Any) -> None:
         sapien, px, m = self._sapien, self._px, self._m
@@ -321,12 +318,8 @@ class PhysxWorld(World):
             pose = sapien.Pose(m.geom_pos[geom], m.geom_quat[geom])
             kind, size = m.geom_type[geom], m.geom_size[geom]
             if kind == self._mujoco.mjtGeom.mjGEOM_MESH:
-                mesh = int(m.geom_dataid[geom])
-                first = int(m.mesh_vertadr[mesh])
-                vertices = m.mesh_vert[first : first + int(m.mesh_vertnum[mesh])]
-                shape = px.PhysxCollisionShapeConvexMesh(
-                    np.asarray(vertices, np.float32), np.ones(3, np.float32), self._material
-                )
+                corners = np.asarray(mesh_corners(m, geom), np.float32)
+                shape = px.PhysxCollisionShapeConvexMesh(corners, np.ones(3, np.float32), self._material)
             elif kind == self._mujoco.mjtGeom.mjGEOM_SPHERE:
                 shape = px.PhysxCollisionShapeSphere(float(size[0]), self._material)
             elif kind == self._mujoco.mjtGeom.mjGEOM_BOX:
@@ -352,7 +345,7 @@ class PhysxWorld(World):
             if len(some) == 1 or leader not in driven:
                 continue
             joints, multiplier, offset = (np.array(column) for column in zip(*some, strict=True))
-            gain, damping = self._gains(driven[leader])
+            gain, damping = drive_gains(m, driven[leader])
             stiffness = _COUPLING * gain * (arm[leader] / arm[joints]) ** 2
             tie = np.stack([stiffness, 2.0 * np.sqrt(stiffness * m.dof_M0[m.jnt_dofadr[joints]])])
             own = np.array([[gain], [damping]]) * tie / (multiplier**2 * tie).sum(1, keepdims=True)
@@ -362,6 +355,3 @@ class PhysxWorld(World):
             self._coupled.append(
                 _Coupled(driven[leader], places, multiplier, offset, tie, own, effort_limit(m, leader))
             )
-
-    def _gains(self, drive: int) -> tuple[float, float]:
-        return float(self._m.actuator_gainprm[drive, 0]), float(-self._m.actuator_biasprm[drive, 2])

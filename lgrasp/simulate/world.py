@@ -11,7 +11,7 @@ from lgrasp.simulate.model import Model
 class World(ABC):
     """One hand and its objects in a simulator: set, driven, pushed, stepped and read.
 
-    O objects, B bodies and J joints as MuJoCo counts them, K columns of q. A world serves one thread.
+    O objects and B bodies as MuJoCo counts them, K columns of q. A world serves one thread.
 
     Args:
         model: O objects in the order of the rows.
@@ -65,10 +65,6 @@ class World(ABC):
     @abstractmethod
     def velocities(self) -> np.ndarray:
         """Linear [m/s] and angular [rad/s] velocities of the objects (O, 6)."""
-
-    @abstractmethod
-    def hand_joints(self) -> np.ndarray:
-        """Positions of the hand's joints in the order of the model (J,) [rad or m]."""
 
     @abstractmethod
     def frames(self) -> tuple[np.ndarray, np.ndarray]:
