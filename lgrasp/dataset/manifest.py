@@ -299,11 +299,15 @@ class Differences(NamedTuple):
     """Names of files that are not listed."""
     listed: int
     """Files that the manifest lists."""
+    unfinished: list[str]
+    """Those of the missing that are there, though not listed as finished."""
 
     def missing_line(self, path: Path) -> str:
-        """How much is missing, by a manifest; "" if nothing is."""
-        line = f"{path}: {len(self.missing)} of {self.listed} shards are missing, first "
-        return line + self.missing[0] if self.missing else ""
+        """How much is missing, by a manifest, and what to do; "" if nothing is."""
+        gone = [name for name in self.missing if name not in self.unfinished]
+        kinds = {"missing": gone, "there but not listed as finished": self.unfinished}
+        lines = [f"{len(n)} of {self.listed} shards are {how}, first {n[0]}" for how, n in kinds.items() if n]
+        return f"{path}: {'; '.join(lines)}; repeat the run's command, which keeps what is there" if lines else ""
 
     def foreign_line(self, path: Path) -> str:
         """How much is not listed in a manifest; "" if all is."""
@@ -318,15 +322,16 @@ def compare(files: Iterable[Path], manifest: Manifest, *, verify: bool = True) -
         verify: Read the files for their SHA-256; else their sizes are compared.
     """
     there = {path.name: path for path in files}
-    missing, changed = [], {}
+    missing, changed, unfinished = [], {}, []
     for shard in manifest.shards:
         path = there.pop(shard.file, None)
         if shard.rows is None or (shard.written and path is None):
             missing.append(shard.file)
+            unfinished += [shard.file] if path else []
         elif path is not None and (how := _difference(shard, path, verify)):
             changed[shard.file] = how
     foreign = [name if name.isprintable() else ascii(name) for name in there]
-    return Differences(sorted(missing), changed, foreign, len(manifest.shards))
+    return Differences(sorted(missing), changed, foreign, len(manifest.shards), sorted(unfinished))
 
 
 def compare_folder(folder: Path, *, verify: bool = True) -> Differences | None:
@@ -372,13 +377,11 @@ def tell_differences(paths: Paths) -> None:
     """Report what is missing from folders, or not listed, by their manifests; the files are not read."""
     for folder in folders_below(paths):
         try:
-            found = compare_folder(folder, verify=False)
+            if found := compare_folder(folder, verify=False):
+                notice(found.missing_line(folder / MANIFEST))
+                notice(found.foreign_line(folder / MANIFEST))
         except ShardError as error:
             notice(str(error))
-            continue
-        if found:
-            notice(found.missing_line(folder / MANIFEST))
-            notice(found.foreign_line(folder / MANIFEST))
 
 
 def _difference(shard: ListedShard, path: Path, verify: bool) -> str:

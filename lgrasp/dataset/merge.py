@@ -165,7 +165,7 @@ def _check_manifest(
     found = compare(shards, manifest)
     if line := found.missing_line(path):
         if not partial:
-            raise ShardError(f"{line}; run the job again to make them, or merge what is there with --partial")
+            raise ShardError(f"{line}, or merge that with --partial")
         notice(f"{line}; what is there is merged")
     for name, how in found.changed.items():
         raise ShardError(f"{path.parent / name}: {how}")

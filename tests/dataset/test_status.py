@@ -18,6 +18,8 @@ from lgrasp.engine.run import run
 from lgrasp.errors import ShardError
 from lgrasp_cli.main import app
 
+AGAIN = "repeat the run's command, which keeps what is there"
+
 
 def call(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
@@ -102,7 +104,7 @@ def test_check(tmp_path, said):
     result = call("dataset", "check", tmp_path)
     assert result.exit_code == 2
     missing, changed = sorted(result.stderr.splitlines())
-    assert missing == f"{tmp_path / 'manifest.json'}: 1 of 3 shards are missing, first toy-cup-00000.h5"
+    assert missing == f"{tmp_path / 'manifest.json'}: 1 of 3 shards are missing, first toy-cup-00000.h5; {AGAIN}"
     assert changed.startswith(f"{tmp_path / 'toy-cup-00001.h5'}: ")
     assert "manifest.json says" in changed
     assert said == [f"{tmp_path / 'manifest.json'}: 1 of the shards there are not listed, first other.h5"]
@@ -110,6 +112,18 @@ def test_check(tmp_path, said):
     result = call("dataset", "check", tmp_path)
     assert result.exit_code == 2
     assert result.stderr.startswith(f"{tmp_path / 'manifest.json'}: not a manifest of shards")
+
+
+def test_a_shard_that_came_after_the_manifest(tmp_path):
+    """The disk was full when the manifest was to be written: the same job lists the shard, and does not make it."""
+    run(SampleJob(out=tmp_path), StopAfter(2))
+    before = (tmp_path / "manifest.json").read_bytes()
+    run(SampleJob(out=tmp_path))
+    (tmp_path / "manifest.json").write_bytes(before)
+    how = f"1 of 3 shards are there but not listed as finished, first toy-cup-00002.h5; {AGAIN}"
+    assert call("dataset", "check", tmp_path).stderr == f"{tmp_path / 'manifest.json'}: {how}\n"
+    assert run(SampleJob(out=tmp_path)).written == []
+    assert call("dataset", "check", tmp_path).stdout == "3 shards valid\n"
 
 
 def test_dataset_says_what_is_missing(tmp_path, said):

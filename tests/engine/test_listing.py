@@ -133,7 +133,7 @@ def test_more_and_fewer_rows_later(tmp_path):
     assert entries(tmp_path) == [(2, 2)] * 4
     run(SampleJob(out=tmp_path, rows=3))  # what is there stays
     assert entries(tmp_path) == [(2, 2), (1, 2), (None, 2), (None, 2)]
-    assert differences(tmp_path) == ([], {}, [], 4)
+    assert differences(tmp_path) == ([], {}, [], 4, [])
 
 
 def test_runs_of_one_folder(tmp_path):
@@ -149,7 +149,7 @@ def test_runs_of_one_folder(tmp_path):
         (["bowl"], 0, 1),
         (["cup"], 1, 1),
     ]
-    assert differences(tmp_path) == ([], {}, [], 2)
+    assert differences(tmp_path) == ([], {}, [], 2, [])
 
 
 def test_tasks_that_replace_a_run_keep_what_others_made(tmp_path):
@@ -159,13 +159,13 @@ def test_tasks_that_replace_a_run_keep_what_others_made(tmp_path):
         run(SampleJob(out=tmp_path, rows=rows, seed=1), array=(task, 2), resume=False)
     names = [f"toy-cup-{n:05d}.h5" for n in (0, 1, 2, 3)]
     assert sorted(path.name for path in tmp_path.glob("*.h5")) == names
-    assert differences(tmp_path) == ([], {}, [], 4)
+    assert differences(tmp_path) == ([], {}, [], 4, [])
 
 
 def test_a_run_that_finds_no_more_is_not_incomplete(tmp_path):
     run(SampleJob(out=tmp_path, rows=9, most=3))
     assert entries(tmp_path) == [(2, 2), (2, 1), (2, 0), (2, 0), (1, 0)]
-    assert differences(tmp_path) == ([], {}, [], 5)
+    assert differences(tmp_path) == ([], {}, [], 5, [])
     assert len(list(tmp_path.glob("*.h5"))) == 3
     before = (tmp_path / "manifest.json").read_bytes()
     run(SampleJob(out=tmp_path, rows=9, most=3))
@@ -178,7 +178,7 @@ def test_files_that_came_before_the_manifest_belong(tmp_path):
     (tmp_path / "manifest.json").unlink()
     run(SampleJob(out=tmp_path, rows=6))
     assert [(r["job"], len(r["shards"])) for r in document(tmp_path)["runs"]] == [("", 1), ("sample", 3)]
-    assert differences(tmp_path) == ([], {}, [], 4)
+    assert differences(tmp_path) == ([], {}, [], 4, [])
     run(SampleJob(out=tmp_path, rows=2, name="bowl"))
     assert [r["job"] for r in document(tmp_path)["runs"]] == ["sample", "sample"]
 
@@ -242,7 +242,7 @@ def test_a_run_in_a_folder_where_another_is_at_work(tmp_path, resume):
         go_on.set()
         assert len(first.result().written) == 3
     assert [(r["seed"], len(r["shards"])) for r in document(tmp_path)["runs"]] == [(0, 3)]
-    assert differences(tmp_path) == ([], {}, [], 3)
+    assert differences(tmp_path) == ([], {}, [], 3, [])
 
 
 def test_a_run_whose_files_came_while_it_loaded(tmp_path):
