@@ -162,11 +162,10 @@ def generate(
         run_all(requests, how, dry_run=dry_run)
         return
     request = requests[0].model_copy(update={"out": out}) if out else requests[0]
-    job = how.checked(request)
     if dry_run:
-        show_plans([(job, how)], how)
+        show_plans([request], how)
     else:
-        how.run(job, _show, _profile)
+        how.run(how.checked(request), _show, _profile)
 
 
 def _show(data: dict[str, Any]) -> list[Block]:

@@ -16,7 +16,6 @@ from lgrasp_cli.working import How, conclude, merely_checked, run_job, working
 
 if TYPE_CHECKING:
     from lgrasp.engine.request import Request
-    from lgrasp.engine.run import Job
 
 
 def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
@@ -28,7 +27,7 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
     if merely_checked(requests, how.cache):
         return
     if dry_run:
-        show_plans([(r.job(how.cache), own) for r, own in zip(requests, how.of_each(requests), strict=True)], how)
+        show_plans(requests, how)
         return
     results = []
     with how.spread(requests) as each:
@@ -47,13 +46,24 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
         raise typer.Exit(code)
 
 
-def show_plans(jobs: "list[tuple[Job, How]]", how: How) -> None:
-    """Print the plans of jobs, each with its own array task."""
-    from lgrasp.jobs.preview import preview
+def show_plans(requests: "Sequence[Request]", how: How) -> None:
+    """Print the plans of jobs, each with its own array task, and a line for each that would fail; leave with the worst
+    exit code."""
+    from lgrasp.errors import LgraspError
+    from lgrasp.jobs.preview import PlanLine, preview
 
-    lines = list({x: None for job, own in jobs for x in preview(job, array=own.array, resume=not own.overwrite)})
-    table = TextTable(("what", "which", "state", "to do", "file"), lines)
-    print_report([line._asdict() for line in lines], how.json_path, [table])
+    found: dict[PlanLine, None] = {}
+    code = 0
+    for request, own in zip(requests, how.of_each(requests), strict=True):
+        try:
+            found |= dict.fromkeys(preview(own.checked(request), array=own.array, resume=not own.overwrite))
+        except LgraspError as error:
+            code = max(code, error.exit_code)
+            typer.echo(f"error: {error}", err=True)
+    table = TextTable(("what", "which", "state", "to do", "file"), list(found))
+    print_report([line._asdict() for line in found], how.json_path, [table] if found else ())
+    if code:
+        raise typer.Exit(code)
 
 
 def _run_one(request: "Request", how: How) -> dict[str, Any]:

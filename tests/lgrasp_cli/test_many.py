@@ -51,6 +51,19 @@ def test_what_is_left_out_of_a_folder_is_told(cli, meshes, quick):
     assert ("allegro-small" in taken.out, taken.err) == (True, "")
 
 
+def test_a_plan_shows_the_jobs_that_fail_and_the_others(cli, meshes, quick):
+    """Two of the folders are not those of this run."""
+    base = ("generate", "-p", quick, "-n", 4, "--device", "cpu", "--dry-run", "--object", "meshes")
+    (meshes / "x.obj").write_text("# no mesh")
+    (meshes.parent / "grasps").mkdir()
+    for name in ("sphere", "x"):
+        (meshes.parent / "grasps" / f"allegro-{name}").touch()
+    plan = cli(*base)
+    assert plan.code == 2
+    assert [name in line for name, line in zip(("sphere", "x"), plan.err.splitlines(), strict=True)] == [True] * 2
+    assert "grasps/allegro-tiny/quick" in plan.out
+
+
 def test_revisions_of_a_known_hand_are_called_as_their_files(cli, quick, tmp_path):
     for name in ("rev_a", "rev_b"):
         shutil.copy(find_hand("allegro").urdf, tmp_path / f"{name}.urdf")
