@@ -199,14 +199,14 @@ class Check:
         wp.launch(find_stable_squeeze, m, inputs, [packed], device=d)
         wp.launch(limit_squeeze, m, [hand, limits, row], [packed], device=d)
         tried, stuck = wp.zeros(m, dtype=wp.int32, device=d), wp.zeros(1 + m, dtype=wp.int32, device=d)
-        inputs = [hand, obj, self.held.struct, limits, at, opened, row]
+        inputs = [hand, obj, self.held.struct, limits, places, at, opened, row]
         wp.launch(try_openings, (OPENING_SHARES, m), inputs, [tried], device=d)
         wp.launch(open_poses, m, [hand, at, opened, row, tried], [packed, stuck], device=d)
         clear = wp.zeros((m, model.groups), dtype=wp.int32, device=d)
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)
         inputs = [hand, self.held.struct, limits, at, opened, row, stuck, clear]
         wp.launch(open_fingers, m, inputs, [packed], device=d)
-        wp.launch(measure_closing, (model.groups, m), [hand, obj, at, row], [packed], device=d)
+        wp.launch(measure_closing, (model.groups, m), [hand, obj, limits, places, at, row], [packed], device=d)
         wp.launch(grasp_epsilon, m, [obj, seed, limits, places, at, row], [packed], device=d)
         wp.launch(pack_rows, m, [hand, places, at, found, row], [packed], device=d)
         return packed

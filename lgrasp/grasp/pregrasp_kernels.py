@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.grasp.bounds import ANY_PENETRATION
 from lgrasp.grasp.check_kernels import hand_pairs_clear
-from lgrasp.grasp.check_structs import CheckedPostures, Limits, Packed
+from lgrasp.grasp.check_structs import CheckedPostures, Limits, Packed, Places
 from lgrasp.grasp.collision import body_apart, body_depth, body_height, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held
 from lgrasp.hand.arrays import Hand
@@ -27,6 +27,28 @@ _NEAR = wp.constant(0.002)  # [m] bodies whose samples are farther from the obje
 
 
 @wp.func
+def _rests(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, T_grasp: wp.transform, margin: wp.float32):
+    """True if a body is nearer to the object than ``margin`` [m] at the grasp already, and at T no deeper in it than
+    there. Both are T_object_body."""
+    if body_apart(hand, obj, body, T_grasp, margin):
+        return False
+    most = body_depth(hand, obj, body, T_grasp, _DEEPEST) + _INSIDE
+    return body_depth(hand, obj, body, T, most) <= most
+
+
+@wp.func
+def _touching_bodies(hand: Hand, places: Places, at: CheckedPostures, s: wp.int32, g: wp.int32):
+    """Bit k: body k of group g has a contact in hand s."""
+    bits = int(0)
+    for c in range(at.contact.shape[1]):
+        if at.contact[s, c] >= 0:
+            b = places.body[at.contact[s, c]]
+            if b > 0 and hand.body_group[b] == g:
+                bits = bits | (1 << (b - 1 - hand.kin.joint_first[g]))
+    return bits
+
+
+@wp.func
 def finger_clear(
     hand: Hand,
     obj: Object,
@@ -37,20 +59,30 @@ def finger_clear(
     T: wp.transform,
     pose: wp.int32,
     X: wp.array(dtype=wp.transform),
+    X_grasp: wp.array(dtype=wp.transform),
+    touching: wp.int32,
 ):
-    """1 if the bodies of a finger are off the object at T, its table and what is held; X[j] = pose of body 1 + j."""
+    """1 if the bodies of a finger are off the object at T, its table and what is held. Bodies without a contact on
+    which the object rests at the grasp may stay there.
+
+    Args:
+        X: (bodies - 1,) X[j] = pose of body 1 + j. X_grasp: the same at the grasp.
+        touching: bit k: body k of the finger has a contact.
+    """
     T_object = wp.transform_inverse(T)
     plane = resting_plane(obj, T, pose)
     above = limits.min_table_distance
-    clear = int(1)
+    margin = limits.min_pregrasp_distance
     for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-        if clear == 1 and not body_apart(hand, obj, 1 + k, T_object * X[k], limits.min_pregrasp_distance):
-            clear = 0
-        if clear == 1 and body_height(hand.pieces, 1 + k, X[k], plane, above) < above:
-            clear = 0
-        if clear == 1 and not body_clear_of_held(hand, held, h, 1 + k, X[k], limits.min_self_distance):
-            clear = 0
-    return clear
+        if not body_apart(hand, obj, 1 + k, T_object * X[k], margin):
+            contact = (touching >> (k - hand.kin.joint_first[g])) & 1
+            if contact == 1 or not _rests(hand, obj, 1 + k, T_object * X[k], T_object * X_grasp[k], margin):
+                return 0
+        if body_height(hand.pieces, 1 + k, X[k], plane, above) < above:
+            return 0
+        if not body_clear_of_held(hand, held, h, 1 + k, X[k], limits.min_self_distance):
+            return 0
+    return 1
 
 
 @wp.func
@@ -83,6 +115,7 @@ def try_openings(
     obj: Object,
     held: Held,
     limits: Limits,
+    places: Places,
     at: CheckedPostures,
     opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
@@ -106,11 +139,12 @@ def try_openings(
     for g in range(G):
         x = _opened_share(at.posture[s, g], opened[i, g, 0], t)
         group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
-        clear = int(1)
         if at.chosen[s, g] >= 0:
-            clear = finger_clear(hand, obj, held, limits, h, g, at.pose[at.of[s]], at.resting[at.of[s]], X)
-        if clear == 0:
-            return
+            touching = _touching_bodies(hand, places, at, s, g)
+            pose = at.pose[at.of[s]]
+            resting = at.resting[at.of[s]]
+            if finger_clear(hand, obj, held, limits, h, g, pose, resting, X, at.body[s], touching) == 0:
+                return
     for b in range(G):
         for a in range(b + 2):
             moves = at.chosen[s, b] >= 0 or (a > 0 and at.chosen[s, wp.max(a - 1, 0)] >= 0)
@@ -194,6 +228,7 @@ def try_fingers(
     obj: Object,
     held: Held,
     limits: Limits,
+    places: Places,
     at: CheckedPostures,
     opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
@@ -220,7 +255,8 @@ def try_fingers(
     x = opened_finger(hand, held, h, g, t, at.posture[s, g], opened[i, g, 0], opened[i, g, 1])
     group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
     r = at.of[s]
-    if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X) == 1:
+    touching = _touching_bodies(hand, places, at, s, g)
+    if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, at.body[s], touching) == 1:
         wp.atomic_or(clear_out, k, g, 1 << t)
 
 
@@ -281,13 +317,15 @@ def open_fingers(
 def measure_closing(
     hand: Hand,
     obj: Object,
+    limits: Limits,
+    places: Places,
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
     packed_out: Packed,
 ):
     """Deepest penetration [m] of fingers and object two thirds of the straight way from ``q_pregrasp`` to ``q``, and
     how far the middle of a link moves in thirds of that way which it begins inside the object [m], the first left out:
-    a finger that goes through the object pushes it away, however thin that is.
+    a finger that goes through the object pushes it away, however thin that is. Not of bodies on which it just rests.
 
     One thread per (group, row); ``closing_penetration`` and ``closing_sweep`` grow to the largest.
 
@@ -310,6 +348,7 @@ def measure_closing(
     inside = wp.zeros(shape=(MAX_BODIES,), dtype=wp.int32)
     swept = wp.zeros(shape=(MAX_BODIES,), dtype=wp.float32)
     T_object = wp.transform_inverse(at.pose[at.of[s]])
+    touching = _touching_bodies(hand, places, at, s, g)
     deepest = float(0.0)
     farthest = float(0.0)
     for part in range(1, _PARTS + 1):
@@ -326,6 +365,9 @@ def measure_closing(
             if part < _PARTS and not body_apart(hand, obj, 1 + j, T, _NEAR):
                 last = part == _PARTS - 1
                 depth = body_depth(hand, obj, 1 + j, T, wp.where(last, _DEEPEST, _INSIDE))
+                free = depth > 0.0 and (touching >> (j - hand.kin.joint_first[g])) & 1 == 0
+                if free and _rests(hand, obj, 1 + j, T, T_object * at.body[s, j], limits.min_pregrasp_distance):
+                    depth = float(0.0)
                 if last:
                     deepest = wp.max(deepest, depth)
                 if depth > _INSIDE:

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
+from support.urdfs import gripper
 
 from lgrasp.engine.batch import run_stages
 from lgrasp.engine.cache import Cache
@@ -16,8 +18,14 @@ from lgrasp.grasp.check import check_grasps, known_contacts
 from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.outcomes import METRICS, REASONS, Outcome
 from lgrasp.grasp.tables import GraspTable
+from lgrasp.hand.arrays import upload_hand
+from lgrasp.hand.build import build_hand
+from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.hands import for_hand
+from lgrasp.object.arrays import upload_object
+from lgrasp.object.params import ObjectParams
+from lgrasp.object.preprocess import preprocess_object
 from lgrasp.runtime.device import resolve_device
 from lgrasp.stages.context import Context
 
@@ -102,3 +110,21 @@ def test_every_row_of_a_pipeline_passes(hand, name, hand_inputs, robust):
     for metric in METRICS:
         atol = 0 if metric in SAME else 0.05 if metric == "epsilon" else 2e-3
         np.testing.assert_allclose(again.metrics[metric], table.metrics[metric], rtol=0, atol=atol, err_msg=metric)
+
+
+def test_jaws_open_where_the_object_rests_on_the_body(tmp_path):
+    """One drive moves both jaws, one of which is made the base: the body moves along the cube."""
+    made = import_urdf(gripper(tmp_path, mimic=True), out=tmp_path / "made")
+    model = build_hand(made.folder / "hand.urdf", made.spec)
+    cube = preprocess_object(trimesh.creation.box([0.04] * 3), params=ObjectParams(contact_count=512))
+    x = -0.02 if made.spec.base_link == "jaw_l" else 0.02
+    pose = np.array([[x, 0, -0.005 + 0.02 - sunk, 0, 0, 0, 1] for sunk in (0.0, 0.0005)], np.float32)
+    normals = np.tile([[1.0, 0, 0], [-1, 0, 0]], (2, 1, 1))
+    links = np.tile([model.tree.link_names.index(name) for name in ("jaw_l", "jaw_r")], (2, 1))
+    contacts = known_contacts(links, 0.02 * normals, normals, "cpu")
+    hand, obj, q = upload_hand(model, "cpu"), upload_object(cube, "cpu"), np.full((2, 1), 0.02, np.float32)
+    table, outcome = check_grasps(hand, obj, pose, q, contacts, GraspBounds())
+    assert (outcome == Outcome.KEPT).all()
+    assert table.metrics["penetration"] == pytest.approx([0.0, 0.0005], abs=1e-5)
+    assert table.q_pregrasp - q == pytest.approx(np.full((2, 1), 0.0075), abs=1e-5)
+    assert table.metrics["closing_penetration"] == pytest.approx(0.0)

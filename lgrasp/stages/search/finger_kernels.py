@@ -161,7 +161,9 @@ def _opens(
     h = candidates.poses.index[row] // held.tries
     first = hand.kin.joint_first[g]
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    group_forward(hand.kin, g, q, X, first)
+    X_grasp = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    group_forward(hand.kin, g, q, X_grasp, first)
+    touching = int(0)
     body = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.int32)
     points = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     normals = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
@@ -173,8 +175,9 @@ def _opens(
             place = candidates.further[row, g, m][FURTHER + f - 1]
             s = candidates.further[row, g, m][f - 1]
         body[n] = hand.contacts.body[place] - 1 - first
+        touching = touching | (1 << body[n])
         p = wp.transform_point(pose, obj.contact_points[s])
-        points[n] = wp.transform_point(wp.transform_inverse(X[first + body[n]]), p)
+        points[n] = wp.transform_point(wp.transform_inverse(X_grasp[first + body[n]]), p)
         normals[n] = wp.transform_vector(pose, obj.contact_normals[s])
         n += 1
     opened = shift_contact(hand, g, q, body[0], points[0], normals[0] * limits.pregrasp_distance)
@@ -186,7 +189,8 @@ def _opens(
         moved = joint_motion(hand, g, x, q)
         if moved >= limits.min_pregrasp_opening:
             group_forward(hand.kin, g, x, X, first)
-            if finger_clear(hand, obj, held, limits, h, g, pose, candidates.poses.resting[row], X) == 1:
+            resting = candidates.poses.resting[row]
+            if finger_clear(hand, obj, held, limits, h, g, pose, resting, X, X_grasp, touching) == 1:
                 return moved <= limits.max_closing_travel
     return False
 
