@@ -1,6 +1,6 @@
 """From the user's name of a hand to its URDF file and rules."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,12 +73,17 @@ def _from_folder(folder: Path, urdf: Path | None = None, note: str = "") -> Hand
     return HandSource(spec.name, urdf or folder / spec.urdf, spec, note)
 
 
-def rules_of_known(path: Path) -> HandSource | None:
+def rules_of_known(path: Path, folders: Iterable[Path] | None = None) -> HandSource | None:
     """The URDF, called as its file, with the rules of the known hand whose joint and link names all occur in it; of
-    several of the one whose joints are nearest, if not turned."""
+    several of the one whose joints are nearest, if not turned.
+
+    Args:
+        folders: of hands that it may be; default: all that are known.
+    """
     urdf = read_urdf(path)
     movable = {j.name: j for j in urdf.joints if j.movable}
-    alike = list(_known_alike(urdf, set(movable)))
+    folders = known_hands().values() if folders is None else folders
+    alike = list(_known_alike(urdf, set(movable), folders))
     if not alike:
         return None
 
@@ -108,9 +113,9 @@ def rules_of_known(path: Path) -> HandSource | None:
     return HandSource(name, path, spec, note + left_out, "" if other else source.name)
 
 
-def _known_alike(urdf: Urdf, movable: set[str]) -> Iterator[tuple[HandSource, Urdf]]:
-    """Known hands that have the same movable joints and no other links."""
-    for folder in known_hands().values():
+def _known_alike(urdf: Urdf, movable: set[str], folders: Iterable[Path]) -> Iterator[tuple[HandSource, Urdf]]:
+    """Hands of these folders that have the same movable joints and no other links."""
+    for folder in folders:
         try:
             source = _from_folder(folder)
             own = read_urdf(source.urdf)

@@ -13,8 +13,10 @@ from lgrasp.engine.run import run as generate
 from lgrasp.field.params import FieldParams
 from lgrasp.grasp.records import GraspRows
 from lgrasp.hand.arrays import body_poses, upload_hand
+from lgrasp.hand.drafting.import_urdf import import_urdf
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.judge.run import judge
@@ -86,6 +88,10 @@ def test_couplings_of_the_known_hand_fill_gaps(tmp_path):
     coupling = source.spec.mimic["finger_2_prox_joint"]
     assert (coupling.joint, coupling.multiplier) == ("finger_1_prox_joint", -1.0)
     assert len(source.spec.mimic) == 4
+    made = import_urdf(bare, out=tmp_path / "made")
+    assert any(line.startswith("couplings of finger_1_dist_joint, finger_2_prox") for line in made.decisions)
+    mimic = {j.name: j.mimic for j in read_urdf(made.folder / "hand.urdf").joints if j.mimic}
+    assert mimic == {n: (c.joint, c.multiplier, c.offset) for n, c in source.spec.mimic.items()}
 
 
 def test_joints_that_only_the_rules_couple_are_in_the_shard(cache, tmp_path):

@@ -24,6 +24,7 @@ from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.mjcf import mjcf_to_urdf
 from lgrasp.hand.drafting.two_jaw import find_jaws, reroot
 from lgrasp.hand.drafting.write import write_spec
+from lgrasp.hand.find import rules_of_known
 from lgrasp.hand.geometry import MOST_FACES, read_mesh, thin_mesh
 from lgrasp.hand.names import known_hands, name_of_file, slug
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
@@ -31,7 +32,7 @@ from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, read_robo
 from lgrasp.paths import cache_dir, data_dirs, user_dir
 from lgrasp.words import listed
 
-_DRAFT_VERSION = 7
+_DRAFT_VERSION = 8
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
 _FEW = 8  # links that are named
@@ -144,6 +145,7 @@ def _fill(
     changes += _take_meshes(robot, folder, find, originals)
     target = folder / "hand.urdf"
     _write(robot, target)
+    changes += _take_couplings(robot, target)
     if jaws := find_jaws(target):
         reroot(robot, jaws[0])
         _write(robot, target)
@@ -161,13 +163,25 @@ def _fill(
     return written, changes
 
 
+def _take_couplings(robot: etree._Element, target: Path) -> list[str]:
+    """Write the couplings of the shipped hand of these joints and links into a URDF that does not state them."""
+    known = rules_of_known(target, [path.parent for path in _shipped_hands()])
+    if known is None or not known.spec.mimic:
+        return []
+    for joint in robot.iter("joint"):
+        if coupling := known.spec.mimic.get(joint.get("name", "")):
+            etree.SubElement(joint, "mimic", {name: str(value) for name, value in coupling})
+    _write(robot, target)
+    joints = ", ".join(known.spec.mimic)
+    return [f"couplings of {joints}: those of a shipped hand with the same joints and links (<mimic> in hand.urdf)"]
+
+
 def _left_out_couplings(urdf: Path, robot: etree._Element) -> list[str]:
     """Couplings that a file leaves out, at most one line: joints without <mimic> that another URDF of the folder, or a
     shipped one, couples; all joints of that URDF are joints of this ``robot``."""
     names, coupled = _joints(robot)
     beside = (path for path in sorted(urdf.parent.glob("*.urdf")) if path.name != urdf.name)
-    shipped = sorted(data_dirs("hands")[-1].glob("*/hand.urdf"))
-    for other in itertools.islice(itertools.chain(shipped, beside), _MOST_OTHERS):
+    for other in itertools.islice(itertools.chain(_shipped_hands(), beside), _MOST_OTHERS):
         try:
             its_names, its_coupled = _joints(read_robot(other)[0])
         except HandError:
@@ -178,6 +192,10 @@ def _left_out_couplings(urdf: Path, robot: etree._Element) -> list[str]:
                 "their own, say so (mimic)"
             ]
     return []
+
+
+def _shipped_hands() -> list[Path]:
+    return sorted(data_dirs("hands")[-1].glob("*/hand.urdf"))
 
 
 def _joints(robot: etree._Element) -> tuple[set[str], set[str]]:
