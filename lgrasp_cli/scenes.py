@@ -66,7 +66,7 @@ def check(paths: _Paths) -> Answer:
     """
     from lgrasp.dataset.files import find_shards
 
-    find_shards(paths)
+    find_shards(paths, "scene")
     from lgrasp.dataset.manifest import check_files
     from lgrasp.scenes.files import check_scene
 
@@ -82,7 +82,7 @@ def info(paths: _Paths) -> Answer:
     """
     from lgrasp.dataset.files import find_shards
 
-    files = find_shards(paths)
+    files = find_shards(paths, "scene")
     from lgrasp.jobs.scenes.job import describe_scenes
 
     data = describe_scenes(files)

@@ -51,16 +51,20 @@ def sha256(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def find_shards(paths: Paths) -> list[Path]:
+def find_shards(paths: Paths, what: str = "shard") -> list[Path]:
     """The shard files named by paths: a folder stands for its ``*.h5`` files, sorted by name, not recursive.
+
+    Args:
+        what: They are, ``shard`` or ``scene``.
 
     Raises:
         ShardError: A path does not exist, or no shard is left.
     """
     try:
-        return [file for file, _ in _found(paths, deep=False)]
+        return [file for file, _ in _found(paths, deep=False, what=what)]
     except ShardError as error:
-        holding = [folder for folder in folders_below(paths) if next(folder.glob("*.h5"), None)]
+        below = folders_below(paths) if what == "shard" else []  # those below scenes hold their grasps
+        holding = [folder for folder in below if next(folder.glob("*.h5"), None)]
         raise ShardError(f"{error}; name one of its folders, such as {holding[0]}") if holding else error from None
 
 
@@ -128,7 +132,9 @@ def _given(paths: Paths) -> list[Path]:
     return [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
 
 
-def _found(paths: Paths, leave_out: Path | None = None, *, deep: bool = True) -> list[tuple[Path, Path]]:
+def _found(
+    paths: Paths, leave_out: Path | None = None, *, deep: bool = True, what: str = "shard"
+) -> list[tuple[Path, Path]]:
     """Shard files with the folders that were named; with its own for a file that was named."""
     given = _given(paths)
     found: list[tuple[Path, Path]] = []
@@ -141,7 +147,7 @@ def _found(paths: Paths, leave_out: Path | None = None, *, deep: bool = True) ->
     if leave_out is not None:
         found = [(file, top) for file, top in found if not file.resolve().is_relative_to(leave_out.resolve())]
     if not found:
-        raise ShardError(f"no shard (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")
+        raise ShardError(f"no {what} (*.h5) in {', '.join(map(str, given)) or 'an empty list of paths'}")
     return found
 
 

@@ -72,6 +72,9 @@ def test_bad_options(cli, config):
     assert "unknown config of scenes" in cli("scenes", "make", "absent.yaml").error()
     assert "need 0 <= task < number" in cli("scenes", "make", config(), "--array", "3/2").error()
     assert "no such file" in cli("scenes", "check", "absent").error()
+    Path("runs/a").mkdir(parents=True)
+    Path("runs/a/shard.h5").touch()  # no folder of scenes
+    assert cli("scenes", "info", "runs").error() == "error: no scene (*.h5) in runs"
     Path("file").write_text("")
     assert "is a file" in cli("scenes", "make", config(), "--out", "file/out").error()
 
