@@ -85,8 +85,8 @@ def load_mesh(
         except OSError as error:
             raise ObjectError(f"{label}: {error.filename or label}: {error.strerror or error}") from error
         sha = mesh_digest(files)
-        meshes = mesh_parts(path, files)
-        (vertices, faces), parts = join_parts(path, meshes), len(meshes)
+        meshes = _mesh_parts(path, files)
+        (vertices, faces), parts = _join_parts(path, meshes), len(meshes)
     if not len(faces):
         raise ObjectError(f"{label}: 0 faces; a triangle mesh of a solid is accepted")
     used = np.zeros(len(vertices), bool)
@@ -128,6 +128,23 @@ def read_bytes(path: Path, suffixes: Sequence[str], what: str, error: type[Lgras
     return data
 
 
+def read_raw(path: Path) -> RawMesh:
+    """A mesh file as it was written: vertices in the file's order, named groups of faces, colours of vertices.
+
+    Raises:
+        ObjectError: it cannot be read, or holds no faces.
+    """
+    data = read_bytes(path, MESH_SUFFIXES, "a mesh file", ObjectError)
+    if path.suffix.lower() == ".obj":
+        return _parse_obj(path, data)
+    meshes = _mesh_parts(path, mesh_bytes(path, data))
+    vertices, faces = _join_parts(path, meshes)
+    painted: list[Any] = [m.visual for m in meshes]
+    coloured = all(visual.kind == "vertex" for visual in painted)
+    colours = np.concatenate([np.asarray(visual.vertex_colors)[:, :3] for visual in painted]) if coloured else None
+    return RawMesh(vertices, faces, {}, colours)
+
+
 class _Buffers(FilePathResolver):
     """Gives a parser the buffers that were read, and textures, which change no shape, as they are on disk."""
 
@@ -146,19 +163,15 @@ def _check_archive(data: bytes) -> None:
         raise ValueError(f"it unpacks to {size:,} bytes, at most {_MOST_UNPACKED:,} are read")
 
 
-def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
-    """The geometries of a mesh file's bytes, of which nothing is merged.
-
-    Raises:
-        ObjectError: it cannot be read, or holds no faces.
-    """
+def _mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
+    """The geometries of a mesh file's bytes, of which nothing is merged."""
     kind = path.suffix.lower()[1:]
     try:
         check_whole(kind, files[""])
     except ValueError as error:
         raise ObjectError(f"{path}: {error}") from None
     if kind == "obj":  # read by the file's own numbers, which regions go by too
-        raw = parse_obj(path, files[""])
+        raw = _parse_obj(path, files[""])
         return [trimesh.Trimesh(raw.vertices, raw.faces, process=False)]
     options: dict[str, Any] = {}
     if kind == "gltf":
@@ -176,12 +189,8 @@ def mesh_parts(path: Path, files: Mapping[str, bytes]) -> list[trimesh.Trimesh]:
     return meshes
 
 
-def parse_obj(path: Path, data: bytes) -> RawMesh:
-    """The mesh of an OBJ file's bytes.
-
-    Raises:
-        ObjectError: they cannot be read, or hold no faces.
-    """
+def _parse_obj(path: Path, data: bytes) -> RawMesh:
+    """The mesh of an OBJ file's bytes."""
     try:
         return read_obj(data)
     except ValueError as error:
@@ -194,12 +203,8 @@ def _unreadable(path: Path, error: Exception) -> ObjectError:
     return ObjectError(f"{path}: not a readable {kind} mesh ({short_reason(error, 120)}); {accepted} accepted")
 
 
-def join_parts(path: Path, meshes: Sequence[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (v, 3) and faces (f, 3) of all geometries of a file.
-
-    Raises:
-        ObjectError: a face of a vertex that is not there.
-    """
+def _join_parts(path: Path, meshes: Sequence[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (v, 3) and faces (f, 3) of all geometries of a file."""
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
     faces = np.concatenate([np.asarray(m.faces, np.int64) + start for m, start in zip(meshes, starts, strict=False)])
     vertices = np.concatenate([np.asarray(m.vertices, np.float64) for m in meshes])

@@ -10,8 +10,7 @@ import warp as wp
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.obj_file import RawMesh
 from lgrasp.object.kernels import locate_points
-from lgrasp.object.load import load_mesh, read_bytes
-from lgrasp.object.raw_mesh import read_raw
+from lgrasp.object.load import load_mesh, read_bytes, read_raw
 from lgrasp.object.region_text import Region
 from lgrasp.runtime.fetch import to_numpy
 
