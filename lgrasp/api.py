@@ -351,11 +351,7 @@ def pipelines() -> dict[str, str]:
 
 
 def _named(value: Name, what: str, accepted: str = "a name or the path of a file") -> str:
-    """A name or path.
-
-    Raises:
-        ConfigError: something else, such as what was loaded by that name.
-    """
+    """A name or path; ConfigError if it is something else, such as what was loaded by that name."""
     if not isinstance(value, str | PathLike):
         raise ConfigError(f"{what} is a {type(value).__name__}; {accepted} is accepted")
     return fspath(value)

@@ -305,11 +305,8 @@ def _unique(path: Path) -> Path:
 
 
 def _hold(path: Path, make: Callable[[Path], int | None]) -> Path:
-    """A new temporary file or folder beside a path, locked until it is discarded or its process ends in any way.
-
-    Args:
-        make: makes it and gives a descriptor of it, or None if it is gone already.
-    """
+    """A new temporary file or folder beside a path, locked until it is discarded or its process ends in any way;
+    ``make`` gives a descriptor of it, or None if it is gone already."""
     while True:
         temporary = _unique(path)
         descriptor = make(temporary)

@@ -307,12 +307,7 @@ def bench_soak(
 
 
 def _written(json_path: str | None, resume: bool = False) -> str | None:
-    """The file that is written as the benchmark goes on.
-
-    Raises:
-        ConfigError: there is none to resume from.
-        OutputError: it could not be written.
-    """
+    """The file that is written as the benchmark goes on; an error if it cannot be, or is to be resumed and is none."""
     if resume and json_path in (None, "-"):
         from lgrasp.errors import ConfigError
 

@@ -110,11 +110,7 @@ def _exit_code() -> int:
 
 
 def _refuse_empty(words: Sequence[str]) -> None:
-    """Refuse words without anything in them, which paths would take for the current folder.
-
-    Raises:
-        ConfigError: there is one.
-    """
+    """Refuse words without anything in them, which paths would take for the current folder."""
     from lgrasp.errors import ConfigError
 
     for before, word in pairwise(words):

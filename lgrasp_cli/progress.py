@@ -99,12 +99,8 @@ class Bar:
             say(line)
 
     def _speed(self, *at: Any) -> float:
-        """How much is done in a second, from the first result on: what is prepared before it takes time only once.
-        0 if that is not known yet.
-
-        Args:
-            at: what it is that goes on, and how much of it was done in this run.
-        """
+        """How much is done in a second, from the first result on (what is prepared before it takes time only once); 0
+        if not known yet. ``at``: what it is that goes on, and how much of it was done in this run."""
         *what, done = at
         last = self._went[-1][1] if self._went else done
         if what != self._what:

@@ -95,12 +95,7 @@ def submit(
 
 
 def _checked(program: Any, words: list[str]) -> list[tuple[int, str]]:
-    """Of each job of a command how many files it makes, and its own device; it is checked as far as can be told before
-    anything is loaded.
-
-    Raises:
-        LgraspError: an option, a name, a number or a path that cannot be.
-    """
+    """Of each job of a command how many files it makes, and its own device; it is checked without loading anything."""
     from lgrasp.errors import ConfigError
     from lgrasp_cli.options import options_of
     from lgrasp_cli.working import only_checked
@@ -130,11 +125,7 @@ def _more(options: list[str]) -> dict[str, str]:
 
 
 def _script(options: dict[str, str], words: list[str]) -> str:
-    """The script for sbatch.
-
-    Raises:
-        ConfigError: a value of several lines.
-    """
+    """The script for sbatch."""
     from lgrasp.errors import ConfigError
 
     for option, value in options.items():
@@ -153,12 +144,7 @@ def _script(options: dict[str, str], words: list[str]) -> str:
 
 
 def _submit(script: str, logs: Path, name: str) -> tuple[str, Path]:
-    """Number of the submitted job, and the script's file.
-
-    Raises:
-        ConfigError: sbatch refuses it.
-        OutputError: the folder cannot be written.
-    """
+    """Number of the submitted job, and the script's file."""
     from lgrasp.errors import ConfigError
     from lgrasp.files import check_folder, write_file
 

@@ -151,11 +151,7 @@ def _difference(what: str, mine: Any, other: Any) -> str:
 def _check_manifest(
     shards: Sequence[Path], named: str | os.PathLike[str] | None, folder: Path | None, partial: bool
 ) -> bool:
-    """Compare shards with the manifest that is named, else with that of their folder; False if there is none.
-
-    Raises:
-        ShardError: The manifest is damaged, or a shard is missing, changed, or not in a manifest that is named.
-    """
+    """Compare shards with the manifest that is named, else with that of their folder; False if there is none."""
     path = Path(named) if named is not None else folder and folder / MANIFEST
     manifest = None if path is None else read_manifest(path)
     if path is None or manifest is None:

@@ -325,12 +325,8 @@ def _make_parts(
 ) -> None:
     """Make what is missing, in order; parts are written, on other threads, while the next are made.
 
-    Args:
-        replaces: all parts of a job that replaces files; once the first is whole, what else is there of the run before
-            goes.
-
-    Raises:
-        CancelledError: the job was to stop; whole parts are written, those made beside an unfinished one, too.
+    CancelledError comes when whole parts are written, those made beside an unfinished one, too. Once the first of
+    ``replaces``, all parts of a job that replaces files, is whole, what else is there of the run before goes.
     """
     writing: deque[tuple[Part, Made, Future[None]]] = deque()
 

@@ -245,11 +245,7 @@ def _one_folder(first: str, second: str, out: Path) -> str:
 
 
 def _names(hand: str, mesh: str, called: Callable[[str], str]) -> tuple[str, str]:
-    """What a hand and an object are called in the names of folders; a job tells if there is no such thing.
-
-    Args:
-        called: :func:`hand_name`, which reads files.
-    """
+    """Names of a hand (by ``called``) and an object in those of folders; a job tells if there is no such thing."""
     names = Path(hand).stem, Path(mesh).stem
     with suppress(LgraspError):
         names = names[0], find_object(mesh).stem
@@ -291,11 +287,7 @@ def _objects(config: JobConfig) -> tuple[str, ...]:
 
 
 def _contents(config: JobConfig, mesh: str) -> str:
-    """Digest of an object's file.
-
-    Raises:
-        ObjectError: there is no such object.
-    """
+    """Digest of an object's file."""
     return mesh_digest(mesh_bytes(find_object(in_folder(config.object_dir, mesh))))
 
 

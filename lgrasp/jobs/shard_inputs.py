@@ -158,11 +158,7 @@ def _surface(config: Mapping[str, Any]) -> HandParams:
 
 
 def _with_rules(urdf: Path, record: HandRecord, config: Mapping[str, Any]) -> HandSource:
-    """The URDF with the first rules that fit the shard; see :func:`hand_of_shard`.
-
-    Raises:
-        HandError: no rules fit.
-    """
+    """The URDF with the first rules that fit the shard; see :func:`hand_of_shard`."""
     for source in _sources(urdf, record, config):
         try:
             tree = build_tree(read_urdf(urdf), source.spec)

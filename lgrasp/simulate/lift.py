@@ -162,12 +162,7 @@ def lift_row(world: World, model: Model, rows: GraspRows, i: int) -> Lifted:
 
 
 def _carry(world: World, model: Model, course: LiftCourse, home: np.ndarray) -> Lifted:
-    """Go through a course from where everything stands.
-
-    Args:
-        course: in the world frame.
-        home: poses of the objects at the grasp, world frame (O, 7).
-    """
+    """Go through a course from where everything stands; ``home``: objects at the grasp (O, 7), world frame."""
     dt, bounds, table = model.protocol.timestep, Bounds(model.protocol), model.protocol.table
     mass, weight = model.mujoco.body_mass[model.object_body][:, None], model.forces[:, None]
     speed, pushed, settled = np.zeros(3), np.nan, False

@@ -118,11 +118,7 @@ def _closed(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, bool]:
 
 
 def _cut(mesh: trimesh.Trimesh, decompose: Decompose, detail: float, dent: float, timeout: float) -> list[np.ndarray]:
-    """Vertices (V, 3) of convex pieces of a dented mesh.
-
-    Raises:
-        DecomposeError: time-out, crash, or nothing usable came back.
-    """
+    """Vertices (V, 3) of convex pieces of a dented mesh."""
     simple = _simplified(mesh, detail)
     points, triangles = np.asarray(simple.vertices), np.asarray(simple.faces)
     found = decompose(points, triangles, threshold=dent, max_pieces=_MOST_PIECES, timeout=timeout)

@@ -78,10 +78,7 @@ def load_objects(path: str | os.PathLike[str]) -> list[Any]:
 
 
 def _frame(shape: tuple[int, ...]) -> tuple[bytes, bytes]:
-    """What precedes and follows the items of an array of objects.
-
-    In the words of a pickle: make an array, give it this shape, the type of objects, and a list of these items.
-    """
+    """Before and after the items in a pickle: make an array, give it this shape, the type of objects, and the items."""
     header = BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "|O", "fortran_order": False, "shape": shape})
     head = header.getvalue() + pickle.PROTO + bytes([_PROTOCOL])
@@ -171,11 +168,7 @@ def load_plain(data: bytes) -> Any:
 
 
 class _Reader:
-    """Turns what a program left into plain values; one that stands in several places is read once.
-
-    Args:
-        most: values there may be, each counted wherever it stands.
-    """
+    """Turns what a program left into at most so many plain values, each counted wherever it stands, but read once."""
 
     def __init__(self, most: int) -> None:
         self._most, self._count = most, 0

@@ -130,10 +130,7 @@ def _hand(key: tuple[str, str], hand: HandRows, heads: list[Head]) -> dict[str, 
 
 
 def _types(heads: Sequence[Head]) -> dict[str, int]:
-    """Rows by the grasp type that they were asked for; "" for those asked for none; empty if no row was asked for one.
-
-    All rows of a shard were asked for the same one.
-    """
+    """Rows by the grasp type that their shard was asked for; "" for those asked for none; empty if none was for one."""
     counts: Counter[str] = Counter()
     for head in heads:
         counts[asked_type(head.header.config) or ""] += head.rows

@@ -163,11 +163,7 @@ def seen_contacts(table: CandidateTable, context: Context) -> Seen:
 def _hits(
     mine: np.ndarray, at: Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The first that are marked, (P, G, MOST_HITS, 6) points [m] and normals, and how many, (P, G).
-
-    Args:
-        mine: (P, G, K) bool. at: points and normals of the marked ones, by their indices.
-    """
+    """Points [m] and normals (P, G, MOST_HITS, 6) by ``at`` of the first of those marked (P, G, K), and how many."""
     place = np.cumsum(mine, 2) - 1
     row, g, k = np.nonzero(mine & (place < MOST_HITS))
     hits = np.zeros((*mine.shape[:2], MOST_HITS, 6), np.float32)

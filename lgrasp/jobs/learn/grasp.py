@@ -92,11 +92,7 @@ class GraspJob(GraspRequest, NetworkJob):
         return Made(part.rows, predictor_bytes(made))
 
     def _examples(self) -> tuple[HandModel, list[ObjectRecord], SequenceSteps, ViewSet]:
-        """The hand, objects, grasps and views.
-
-        Raises:
-            ConfigError: there are no grasps.
-        """
+        """The hand, objects, grasps and views."""
         p, device = self.params, self.device_used
         parts = read_parts(self.shards)
         hand, _ = load_hand(parts.values(), self.hand, self.cache, device)

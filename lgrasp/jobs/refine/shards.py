@@ -214,13 +214,7 @@ def _check_rows(path: Path, shard: Shard) -> None:
 
 
 def _grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) -> Iterator[Shard]:
-    """Grasps in the format of another program as one shard an object and scale; joints go by their names.
-
-    Raises:
-        ConfigError: an unknown format.
-        ShardError: a file is damaged, names other joints, has no grasps, or the mesh of an object is missing.
-        ObjectError: a mesh cannot be read.
-    """
+    """Grasps in the format of another program as one shard an object and scale; joints go by their names."""
     found = read_grasps(path, form, joint_names=hand.tree.listed_names)
     rows = found.grasps
     if rows.object_index.shape[1] != 1:

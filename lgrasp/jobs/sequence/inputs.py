@@ -175,11 +175,7 @@ def _load_spaces(
 
 def _object_scales(meshes: Sequence[Path], size: Size, seed: int) -> tuple[float, ...]:
     """Factor from each mesh's unit to metres, by its name and the seed: the same with whatever other objects, so that
-    it is prepared once for all sets that it is in.
-
-    Raises:
-        ObjectError: a mesh whose size is needed cannot be read.
-    """
+    it is prepared once for all sets that it is in."""
     if not size.high:
         return (size.low,) * len(meshes)
     drawn = (np.random.default_rng(stage_seed(seed, 0, f"size/{path.stem}")).uniform(*size) for path in meshes)

@@ -113,11 +113,8 @@ def make_sequences(
 
 
 def _begun(needed: int, begun: int, ended: int, pipeline: Pipeline, inputs: SequenceInputs) -> int:
-    """With how many sequences a round is begun, of which fewer were not enough: rows are the same, few take less time.
-
-    Args:
-        needed: whole sequences. begun, ended: sequences of the round so far, and those of them that became whole.
-    """
+    """With how many sequences a round is begun, of which ``begun`` gave ``ended`` whole ones, not the ``needed``: rows
+    are the same, few take less time."""
     params = pipeline.params("sequence")
     if inputs.device.alias != "cpu" or not params.in_waves:  # many take hardly longer
         return params.width
