@@ -7,6 +7,7 @@ import numpy as np
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.urdf import Joint, Urdf, check_mimic
+from lgrasp.math.constants import LIMIT_EXCESS
 
 
 def with_mimic(urdf: Urdf, spec: HandSpec) -> Urdf:
@@ -39,7 +40,11 @@ def _coupling_text(mimic: tuple[str, float, float]) -> str:
 
 
 def find_drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
-    """Of each movable joint: the one behind it, with multiplier and offset composed along the mimic chain."""
+    """Of each movable joint: the one behind it, with multiplier and offset composed along the mimic chain.
+
+    Raises:
+        HandError: a joint that follows 0 times is held outside its limits.
+    """
     by_name = {j.name: j for j in urdf.joints}
     drives = {}
     for joint in (j for j in urdf.joints if j.movable):
@@ -49,6 +54,11 @@ def find_drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
             # x_at = m * x_source + b
             at, mult, offset = by_name[source], mult * m, offset + mult * b
         drives[joint.name] = (at.name, mult, offset)
+        if mult == 0.0 and not joint.lower - LIMIT_EXCESS <= offset <= joint.upper + LIMIT_EXCESS:
+            raise HandError(
+                f"URDF {urdf.path}: joint '{joint.name}' follows '{at.name}' times 0, so it is held at {offset:g}, "
+                f"outside its limits [{joint.lower:g}, {joint.upper:g}]"
+            )
     return drives
 
 

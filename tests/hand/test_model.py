@@ -1,6 +1,7 @@
 """HandModel: groups, limits, solids, pairs and contact surfaces of real and shipped hands."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,16 +114,27 @@ def driven(by_name: dict[str, Joint], source: str) -> list[tuple[Joint, float]]:
     return out
 
 
-def test_mimic_joints_that_exclude_each_other(tmp_path):
+def two_hinges(tmp_path: Path, follower: str, drive: str = '<limit lower="0" upper="1"/>') -> Path:
+    """Joint j, and joint k that follows it."""
     box = '<collision><geometry><box size="0.01 0.01 0.05"/></geometry></collision>'
     links = "".join(f'<link name="{n}">{box}</link>' for n in "abc")
     text = f"""<robot name="r">{links}
-      <joint name="j" type="revolute"><parent link="a"/><child link="b"/><limit lower="0" upper="1"/></joint>
-      <joint name="k" type="revolute"><parent link="a"/><child link="c"/><limit lower="-5" upper="-4"/>
-        <mimic joint="j"/></joint></robot>"""
+      <joint name="j" type="revolute"><parent link="a"/><child link="b"/>{drive}</joint>
+      <joint name="k" type="revolute"><parent link="a"/><child link="c"/>{follower}</joint></robot>"""
     path = tmp_path / "r.urdf"
     path.write_text(text)
+    return path
+
+
+def test_mimic_joints_that_exclude_each_other(tmp_path):
+    path = two_hinges(tmp_path, '<limit lower="-5" upper="-4"/><mimic joint="j"/>')
     with pytest.raises(HandError, match="'j' has no room left"):
+        build_tree(read_urdf(path), minimal_spec("r", ["b"]))
+
+
+def test_a_follower_that_is_held_outside_its_limits(tmp_path):
+    path = two_hinges(tmp_path, '<limit lower="0" upper="1"/><mimic joint="j" multiplier="0" offset="2.5"/>')
+    with pytest.raises(HandError, match=r"r.urdf: joint 'k' follows 'j' times 0.* 2.5, outside its limits \[0, 1\]"):
         build_tree(read_urdf(path), minimal_spec("r", ["b"]))
 
 
