@@ -8,6 +8,7 @@ from pathlib import Path
 import platformdirs
 
 from lgrasp.errors import LgraspError
+from lgrasp.notices import notice
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -19,12 +20,15 @@ def data_dirs(kind: str) -> list[Path]:
         kind: ``hands``, ``objects``, ``pipelines``, ``configs`` or ``models``.
 
     Returns:
-        The folders of ``LGRASP_PATH`` (separated as in ``PATH``), then the user's data folder, then the shipped one.
+        The folders of ``LGRASP_PATH`` (separated as in ``PATH``; one that is not there is reported), then the user's
+        data folder, then the shipped one.
     """
     shipped = _PACKAGE / "_data" / kind
     if not shipped.is_dir():
         shipped = _PACKAGE.parent / kind
     roots = [Path(p).expanduser() for p in os.environ.get("LGRASP_PATH", "").split(os.pathsep) if p]
+    for root in roots:
+        notice("" if root.is_dir() else f"LGRASP_PATH: {root} is no folder")
     return [p for p in (*(root / kind for root in roots), user_dir(kind), shipped) if p.is_dir()]
 
 

@@ -1,6 +1,7 @@
 """The other commands: inputs, stages one by one, lists, configs, cache, bench."""
 
 import json
+import os
 import tempfile
 from pathlib import Path
 
@@ -78,6 +79,12 @@ def test_hands(cli):
     assert {joint["finger"] for joint in data["joints"]} == {0, 1, 2, 3}
     assert "joint_12.0" in cli("hands", "show", "allegro").out
     assert "did you mean 'allegro'" in cli("hands", "show", "alegro").error()
+
+
+def test_a_data_folder_that_is_not_there(cli, monkeypatch, tmp_path):
+    monkeypatch.setenv("LGRASP_PATH", os.pathsep.join(map(str, (tmp_path, tmp_path / "lost"))))
+    listed = cli("pipelines", "list")
+    assert (listed.code, listed.err.count("LGRASP_PATH"), listed.err.count("lost is no folder")) == (0, 1, 1)
 
 
 def test_objects(cli):

@@ -100,6 +100,6 @@ def _factors(text: str, value: str) -> list[float]:
         if all(_LEAST <= factor <= _MOST and factor != 1 for factor in factors):
             return factors
     raise ConfigError(
-        f"--vary '{text}': value '{value}' is not accepted; give factors from {_LEAST:g} to {_MOST:g} other than 1, such as "
-        "0.8,1.2, or percentages with a sign, such as +-20%"
+        f"--vary '{text}': value '{value}' is not accepted; give factors from {_LEAST:g} to {_MOST:g} other than 1, "
+        "such as 0.8,1.2, or percentages with a sign, such as +-20%"
     )
