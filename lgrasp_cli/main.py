@@ -90,15 +90,16 @@ def program() -> Any:
 def main() -> None:
     """Run the command line; exit codes: 0 done, 2 bad input or output, 3 too few grasps, 130 interrupted, 141 nobody
     reads what it prints."""
-    on_notice(warn)
+    on_notice((lambda line: None) if "_LGRASP_COMPLETE" in os.environ else warn)  # a shell shows all
     sys.argv[1:] = renew(sys.argv[1:], options_of(program(), sys.argv[1:]))
-    if os.environ.get("LGRASP_DEBUG", "0") not in ("", "0"):
-        sys.exit(_exit_code())
     try:
         code = _exit_code()
         sys.stdout.flush()
     except BaseException as error:
-        _leave(*_explain(error))
+        line, code = _explain(error)
+        if line and os.environ.get("LGRASP_DEBUG", "0") not in ("", "0"):
+            sys.excepthook(type(error), error, error.__traceback__)
+        _leave(line, code)
     sys.exit(code)
 
 

@@ -19,7 +19,6 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.report.write import read_dataset
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.validate import validate_shard
-from lgrasp.errors import HandError
 from lgrasp.grasp.bounds import GraspBounds
 
 KEYS = {
@@ -308,11 +307,13 @@ def test_closed_streams(tmp_path):
     assert "swift" in [pipeline["name"] for pipeline in json.loads((tmp_path / "pipelines.json").read_text())]
 
 
-def test_debug_leaves_errors_to_python(cli, monkeypatch):
-    """Which shows the traceback."""
+def test_debug_shows_the_traceback_too(cli, monkeypatch):
     monkeypatch.setenv("LGRASP_DEBUG", "1")
-    with pytest.raises(HandError, match="nobody"):
-        cli("hands", "show", "nobody")
+    found = cli("hands", "show", "nobody")
+    assert found.code == 2
+    first, *_, last = found.err.splitlines()
+    assert first.startswith("Traceback")
+    assert last.startswith("error: unknown hand 'nobody'")
 
 
 def test_the_first_kernels_of_a_machine_are_announced(generate, monkeypatch, tmp_path):
