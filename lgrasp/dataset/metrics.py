@@ -32,8 +32,6 @@ def measure_shard(
     """All metrics of a shard by name, each shape [N]; ``step`` rows at a time, ``report`` is called with rows done.
 
     Args:
-        path: The shard.
-        friction: Coefficient of friction.
         each: As of :func:`row_metrics`.
 
     Raises:
@@ -56,9 +54,7 @@ def row_metrics(
     """The columns of ``METRICS`` for some rows, shape [n, 2]; of several objects in a row the least.
 
     Args:
-        rows: Grasps.
         frames: What :func:`mass_frame` says of each of the shard's objects, sorted by id.
-        friction: Coefficient of friction.
         each: ``map``, or another that works on several items at once and yields in order.
     """
     tasks = []  # rows of one object each
@@ -101,8 +97,13 @@ def measured_in(target: Path, source: Path) -> dict[str, str] | None:
             np.array_equal(old.column(name), new.column(name), equal_nan=name != "candidate") for name in _ROW
         ):
             raise OutputError(f"{target} holds other rows than {source}; choose another --out, or --overwrite")
-        told = new.statistics.items()
-        return {name.removesuffix(MEASURED): str(text) for name, text in told if name.endswith(MEASURED)}
+        return measured_with(new)
+
+
+def measured_with(reader: ShardReader) -> dict[str, str]:
+    """The numbers (JSON) with which a shard was measured, by what was added."""
+    told = reader.statistics.items()
+    return {name.removesuffix(MEASURED): str(text) for name, text in told if name.endswith(MEASURED)}
 
 
 @contextmanager

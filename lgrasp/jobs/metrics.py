@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.metrics import MEASURED, METRICS, TASK_ROWS, measure_shard, measured_in, process_map
+from lgrasp.dataset.metrics import MEASURED, METRICS, TASK_ROWS, measure_shard, measured_in, measured_with, process_map
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.dataset.report.write import read_dataset
 from lgrasp.engine.cache import content_key
@@ -22,6 +22,7 @@ from lgrasp.hold.params import HoldTest
 from lgrasp.jobs.difference import text_difference
 from lgrasp.jobs.requests.shards import MetricsRequest
 from lgrasp.jobs.shard_inputs import arrays_of_shard, object_of_shard
+from lgrasp.notices import notice
 from lgrasp.object.arrays import upload_object
 from lgrasp.runtime.cores import threads
 
@@ -87,7 +88,11 @@ class MetricsJob(MetricsRequest, ShardJob):
         assert part.source is not None
         with ShardReader(part.source) as reader:
             (bounds, test), key = self._numbers_of(reader), self.key_of(reader)
-        told = {name + MEASURED: text for name, text in self._measured(bounds, test).items()}
+            asked, there = self._measured(bounds, test), _measured_by_stage(reader) | measured_with(reader)
+        for name in asked.keys() & there.keys():
+            if how := text_difference(there[name], asked[name]):
+                notice(f"{name} of the shards was measured with other numbers ({how}); the copies have the new values")
+        told = {name + MEASURED: text for name, text in asked.items()}
         workers, others = threads(self.workers), [name for name in self.add if name != HOLD]
         kinds, columns = (HOLD in self.add) + bool(others), {}
         if others:
@@ -144,6 +149,14 @@ class MetricsJob(MetricsRequest, ShardJob):
         hand = arrays_of_shard(self.cache, shard.hand, shard.header.config, device)
         obj = upload_object(object_of_shard(self.cache, shard.objects[0], device), device.alias)
         return try_rows(hand, obj, test, shard.grasps, shard.header.seed, workers=workers, progress=progress)
+
+
+def _measured_by_stage(reader: ShardReader) -> dict[str, str]:
+    """The numbers (JSON) with which the pipeline of a shard tried its rows, if it did."""
+    pipeline = reader.header.config.get("pipeline")
+    stages = pipeline.get("stages", ()) if isinstance(pipeline, dict) else ()
+    tried = [stage[HOLD] for stage in stages if HOLD in stage]
+    return {HOLD: json.dumps({k: x for k, x in tried[0].items() if k != "version"}, sort_keys=True)} if tried else {}
 
 
 def _sets(paths: Sequence[Path]) -> list[dict[str, Any]]:

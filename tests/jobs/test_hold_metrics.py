@@ -81,9 +81,12 @@ def test_they_are_those_of_the_stage(tried, add, tmp_path):
     assert (np.abs(drift[0] - drift[1]) < 1e-4).mean() > 0.9
 
 
-def test_with_others_and_again(tried, add, tmp_path):
+def test_with_others_and_again(tried, add, tmp_path, said):
+    """Of more trials than stage hold had, which is told once."""
     watch = Watch()
     add(tried, tmp_path / "out", watch, add=("volume", "hold"), settings=())
+    (line,) = said
+    assert "hold of the shards was measured with other numbers (draws: 2 there, 32 requested)" in line
     assert watch.seen.count(ROWS) == 2
     (first, _) = sorted((tmp_path / "out").glob("*.h5"))
     assert {"volume", *METRICS} <= set(read_shard(first).grasps.metrics)
