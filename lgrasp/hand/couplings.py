@@ -1,5 +1,6 @@
 """Joints that follow others: the couplings of a URDF and of hand.yaml."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,9 @@ from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec
 from lgrasp.hand.urdf import Joint, Urdf, check_mimic
 from lgrasp.math.constants import LIMIT_EXCESS
+from lgrasp.notices import notice
+
+_LITTLE = 0.1  # of a joint's range that followers leave, which is told
 
 
 def with_mimic(urdf: Urdf, spec: HandSpec) -> Urdf:
@@ -54,7 +58,8 @@ def find_drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
             # x_at = m * x_source + b
             at, mult, offset = by_name[source], mult * m, offset + mult * b
         drives[joint.name] = (at.name, mult, offset)
-        if mult == 0.0 and not joint.lower - LIMIT_EXCESS <= offset <= joint.upper + LIMIT_EXCESS:
+        held = mult == 0.0 and not joint.continuous
+        if held and not joint.lower - LIMIT_EXCESS <= offset <= joint.upper + LIMIT_EXCESS:
             raise HandError(
                 f"URDF {urdf.path}: joint '{joint.name}' follows '{at.name}' times 0, so it is held at {offset:g}, "
                 f"outside its limits [{joint.lower:g}, {joint.upper:g}]"
@@ -65,14 +70,16 @@ def find_drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
 def _narrowed(
     drives: list[Joint], followers: list[Joint], drive: dict[str, tuple[str, float, float]]
 ) -> dict[str, tuple[float, float]]:
-    limits = {j.name: (j.lower, j.upper) for j in drives}
+    """Limits that leave each follower within its own; continuous joints have none of their own, and a turn for want of
+    others."""
+    limits = {j.name: (-math.inf, math.inf) if j.continuous else (j.lower, j.upper) for j in drives}
     for j in followers:
         source, mult, offset = drive[j.name]
-        if j.mimic is None or mult == 0.0:
+        if j.mimic is None or mult == 0.0 or j.continuous:
             continue
         a, b = sorted(((j.lower - offset) / mult, (j.upper - offset) / mult))
         limits[source] = max(limits[source][0], a), min(limits[source][1], b)
-    return limits
+    return {j.name: limits[j.name] if math.isfinite(limits[j.name][0]) else (j.lower, j.upper) for j in drives}
 
 
 def free_joints(urdf: Urdf) -> dict[str, Joint]:
@@ -86,17 +93,23 @@ def free_joints(urdf: Urdf) -> dict[str, Joint]:
 def drive_limits(
     actuated: list[Joint], moving: list[Joint], drive: dict[str, tuple[str, float, float]], spec: HandSpec
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of the actuated joints [rad or m], narrowed so that every mimic joint stays inside its own.
+    """Limits of the actuated joints [rad or m], narrowed so that every mimic joint stays inside its own. A notice tells
+    of a joint that has little of its range left.
 
     Raises:
         HandError: nothing is left of them.
     """
     limits = _narrowed(actuated, moving, drive)
-    for name, (lower, upper) in limits.items():
+    for joint, (lower, upper) in zip(actuated, limits.values(), strict=True):
         if lower >= upper:
             raise HandError(
-                f"hand '{spec.name}': joint '{name}' has no room left; the limits of the joints that mimic it "
+                f"hand '{spec.name}': joint '{joint.name}' has no room left; the limits of the joints that mimic it "
                 "exclude each other"
+            )
+        if upper - lower < _LITTLE * (joint.upper - joint.lower) and not joint.continuous:
+            notice(
+                f"hand '{spec.name}': joint '{joint.name}' moves from {lower:g} to {upper:g} only, its limits are "
+                f"[{joint.lower:g}, {joint.upper:g}]: those of the joints that mimic it narrow them"
             )
     lower, upper = np.array(list(limits.values())).T
     return lower, upper

@@ -219,6 +219,11 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
     locked = [j for j in urdf.joints if j.name in fixed and (j.name in spec.locked or j in unstated)]
     coupled = [j for j in unstated if j.name not in fixed]
     coupling = [drive[j.name] for j in coupled]
+    taken = {name: [value] for name, value in fixed.items()}
+    taken |= {
+        j.name: [mult * end[column[source]] + offset for end in (lower, upper)]
+        for j, (source, mult, offset) in zip(coupled, coupling, strict=True)
+    }
     return Tree(
         base_link=base,
         joint_names=tuple(j.name for j in actuated),
@@ -242,12 +247,12 @@ def build_tree(urdf: Urdf, spec: HandSpec) -> Tree:
         settings=settings,
         locked_names=tuple(j.name for j in locked),
         locked_values=np.array([fixed[j.name] for j in locked], np.float32),
-        locked_limits=_own_limits(locked),
+        locked_limits=_own_limits(locked, taken),
         coupled_names=tuple(j.name for j in coupled),
         coupled_column=np.array([column[source] for source, _, _ in coupling], np.int32),
         coupled_mult=np.array([mult for _, mult, _ in coupling], np.float32),
         coupled_offset=np.array([offset for _, _, offset in coupling], np.float32),
-        coupled_limits=_own_limits(coupled),
+        coupled_limits=_own_limits(coupled, taken),
         link_names=tuple(urdf.links),
         link_body=np.array([0 if (c := rides[n][0]) is None else body[c] for n in urdf.links], np.int32),
         T_body_link=np.array([rides[n][1] for n in urdf.links]),
@@ -281,15 +286,18 @@ def _check_fixed(urdf: Urdf, spec: HandSpec, fixed: dict[str, float]) -> None:
         which, excess = "joint that follows a locked one,", LIMIT_EXCESS
         if joint.name in spec.locked:
             which, excess = "locked joint", 1e-6
-        if not joint.lower - excess <= value <= joint.upper + excess:
+        free = joint.continuous and joint.name not in spec.locked
+        if not free and not joint.lower - excess <= value <= joint.upper + excess:
             raise HandError(
                 f"hand '{spec.name}': {which} '{joint.name}' = {value:g} is outside its limits "
                 f"[{joint.lower:g}, {joint.upper:g}]"
             )
 
 
-def _own_limits(joints: list[Joint]) -> np.ndarray:
-    return np.array([(j.lower, j.upper) for j in joints], np.float32).reshape(-1, 2)
+def _own_limits(joints: list[Joint], taken: dict[str, list[float]]) -> np.ndarray:
+    """Limits [rad or m], (n, 2) f32; those of continuous joints hold what they take."""
+    ends = [[j.lower, j.upper, *(taken[j.name] if j.continuous else ())] for j in joints]
+    return np.array([(min(x), max(x)) for x in ends], np.float32).reshape(-1, 2)
 
 
 def _check_shared(spec: HandSpec, moving: list[Joint], urdf: Urdf) -> tuple[str, ...]:

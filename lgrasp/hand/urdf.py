@@ -47,6 +47,7 @@ class Joint:
     upper: float
     mimic: tuple[str, float, float] | None  # source joint, multiplier, offset
     effort: float  # what its drive presses with at most [N m or N]
+    continuous: bool = False  # without limits: lower and upper are a turn
 
     def motion(self, x: np.ndarray) -> np.ndarray:
         """Transforms [..., 4, 4] of the moving frame at positions x [rad or m], shape [...]."""
@@ -347,7 +348,8 @@ def _joint(path: Path, element: etree._Element, links: dict[str, tuple[Geometry,
             factor, offset = (_number(path, where, source, *x) for x in (("multiplier", "1"), ("offset", "0")))
             mimic = (source.get("joint", ""), factor, offset)
     origin = _origin(path, where, element)
-    return Joint(name, parent, child, origin, movable, kind == "prismatic", axis, lower, upper, mimic, effort)
+    turns, slides = kind == "continuous", kind == "prismatic"
+    return Joint(name, parent, child, origin, movable, slides, axis, lower, upper, mimic, effort, turns)
 
 
 def _bounds(path: Path, where: str, joint: etree._Element) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from lgrasp.hand.geometry import convex_piece, geometry_mesh, inner_spheres, lin
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
 from lgrasp.hand.piece import Piece
+from lgrasp.hand.spec import Coupling
 from lgrasp.hand.surface import joined_mesh, outer_mesh
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Geometry, Joint, read_urdf
@@ -115,12 +116,16 @@ def driven(by_name: dict[str, Joint], source: str) -> list[tuple[Joint, float]]:
 
 
 def two_hinges(tmp_path: Path, follower: str, drive: str = '<limit lower="0" upper="1"/>') -> Path:
-    """Joint j, and joint k that follows it."""
+    """Joint j, and joint k that follows it; those without limits are continuous."""
     box = '<collision><geometry><box size="0.01 0.01 0.05"/></geometry></collision>'
     links = "".join(f'<link name="{n}">{box}</link>' for n in "abc")
+
+    def kind(inner: str) -> str:
+        return "revolute" if "<limit" in inner else "continuous"
+
     text = f"""<robot name="r">{links}
-      <joint name="j" type="revolute"><parent link="a"/><child link="b"/>{drive}</joint>
-      <joint name="k" type="revolute"><parent link="a"/><child link="c"/>{follower}</joint></robot>"""
+      <joint name="j" type="{kind(drive)}"><parent link="a"/><child link="b"/>{drive}</joint>
+      <joint name="k" type="{kind(follower)}"><parent link="a"/><child link="c"/>{follower}</joint></robot>"""
     path = tmp_path / "r.urdf"
     path.write_text(text)
     return path
@@ -136,6 +141,35 @@ def test_a_follower_that_is_held_outside_its_limits(tmp_path):
     path = two_hinges(tmp_path, '<limit lower="0" upper="1"/><mimic joint="j" multiplier="0" offset="2.5"/>')
     with pytest.raises(HandError, match=r"r.urdf: joint 'k' follows 'j' times 0.* 2.5, outside its limits \[0, 1\]"):
         build_tree(read_urdf(path), minimal_spec("r", ["b"]))
+
+
+def test_a_drive_with_little_of_its_range_left_is_told(tmp_path, said):
+    path = two_hinges(tmp_path, '<limit lower="-1" upper="0.05"/><mimic joint="j"/>')
+    tree = build_tree(read_urdf(path), minimal_spec("r", ["b"]))
+    assert (tree.joint_lower[0], tree.joint_upper[0]) == pytest.approx((0, 0.05))
+    (line,) = said
+    assert "'j' moves from 0 to 0.05 only, its limits are [0, 1]" in line
+
+
+@pytest.mark.parametrize(
+    ("drive", "follower", "limits"),
+    [
+        ('<limit lower="0" upper="1"/>', "", (0, 1)),
+        ("", '<limit lower="-0.2" upper="1.5"/>', (-0.05, 0.375)),
+        ("", "", (-np.pi, np.pi)),
+    ],
+)
+@pytest.mark.parametrize("stated", [True, False])
+def test_continuous_joints_narrow_nothing(tmp_path, said, drive, follower, limits, stated):
+    spec, mimic = minimal_spec("r", ["b"]), '<mimic joint="j" multiplier="4"/>'
+    if not stated:
+        mimic, spec = "", spec.model_copy(update={"mimic": {"k": Coupling(joint="j", multiplier=4)}})
+    tree = build_tree(read_urdf(two_hinges(tmp_path, follower + mimic, drive)), spec)
+    assert (tree.joint_lower[0], tree.joint_upper[0]) == pytest.approx(limits)
+    if not stated:  # a column of shards
+        lower, upper = tree.coupled_limits[0]
+        assert lower - 1e-6 <= 4 * limits[0] <= 4 * limits[1] <= upper + 1e-6
+    assert not said
 
 
 def surface_distance(mesh: trimesh.Trimesh, p: np.ndarray) -> np.ndarray:
