@@ -278,7 +278,6 @@ def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], wher
     """Models with some of their fields replaced and checked.
 
     Args:
-        parts: models by name.
         settings: ``PART.KEY=VALUE`` each, the value as in YAML.
 
     Raises:

@@ -29,11 +29,8 @@ def say(line: str) -> None:
 
 
 class Bar:
-    """How far something is, and when it will be done: a bar on a terminal, else a line every ten seconds, or nothing.
-
-    Args:
-        quiet: show nothing.
-    """
+    """How far something is, and when it will be done: a bar on a terminal, else a line every ten seconds;
+    nothing where it is ``quiet``."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
@@ -134,11 +131,7 @@ def _time(seconds: float) -> str:
 
 
 class JobProgress(Events):
-    """What a job tells, on a bar.
-
-    Args:
-        unit: what the job counts.
-    """
+    """What a job tells, on a bar."""
 
     def __init__(self, bar: Bar, unit: str) -> None:
         self.stop = self.running = False

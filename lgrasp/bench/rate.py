@@ -30,8 +30,6 @@ def measure(
     Args:
         jobs: what is compared; their folders and caches are not used.
         cache: where hands, objects and fields are made once, and then loaded from.
-        built: how long that took.
-        say: called with one line before each run.
 
     Returns:
         For each job ``pipeline``, ``hand``, ``object``, ``grasps``, ``strict``, ``profile``, ``device``; each rate as

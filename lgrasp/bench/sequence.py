@@ -97,10 +97,6 @@ def measure_sequence(job: SequenceJob, device: str) -> dict[str, Any]:
     Grasps of an optimiser, and of a network as they are drawn, are simulated as published: only a penetration of 1 cm,
     contacts farther away than that, and links in links are left out before.
 
-    Args:
-        job: it names a protocol.
-        device: in words.
-
     Returns:
         ``begun`` (attempts), ``device``, ``spaces`` (name -> sequences tried with it, rows found, rows that held) and
         ``steps``: for each object counts, ``seconds`` (simulation not counted), ``drawn`` candidates, ``outcomes`` of

@@ -117,7 +117,6 @@ def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu
 
     Args:
         whole: what :func:`completed_object` gave. params: of contact points.
-        device: answers the geometric queries.
 
     Raises:
         ObjectError: no two contact points are opposite to each other.

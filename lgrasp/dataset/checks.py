@@ -114,7 +114,6 @@ def row_problems(
 
     Args:
         rows: Rows with the shapes and dtypes of the format.
-        hand: The hand they belong to.
         objects: The shard's objects, sorted by id.
         column: Rows of the whole shard, for rows of sequences, which refer to others.
         first_row: Index of ``rows[0]`` in the shard.

@@ -30,12 +30,8 @@ def extend_shard(
 
     Args:
         source: A shard that conforms; damage would be copied along.
-        out: The file to write.
         metrics: Numbers by name, each shape [N].
-        units: Unit by name.
         physics: Verdicts by name, each shape [N, ...].
-        protocol: That of the verdicts.
-        statistics: Numbers or texts by name.
 
     Raises:
         ShardError: The source cannot be read, or a column has another number of rows.

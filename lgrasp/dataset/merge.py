@@ -38,7 +38,6 @@ def merge_shards(
     one object of all shards come first, then those of two, and so on; ``sequence/parent`` follows.
 
     Args:
-        paths: Shard files, or a folder of them.
         out: The file to write; if it lies in the folder, it is not merged into itself.
         manifest: List to check the shards against; by default ``manifest.json`` of the folder, if there is one.
         partial: Merge what is there, though the list has more.

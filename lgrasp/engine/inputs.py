@@ -226,7 +226,6 @@ def load_inputs(
 
     Args:
         table: also the planes that the object rests on.
-        steer: what is asked of grasps.
 
     Raises:
         ConfigError: something that this hand cannot do, or that this object does not have.

@@ -34,8 +34,6 @@ class Listing:
 
     Args:
         describe: gives the job, without shards; called if there is something to list.
-        root: folder of the job.
-        every: all parts of the job.
         own: those of this process.
         asks: the parts ask for a number of rows.
     """

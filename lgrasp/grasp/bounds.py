@@ -204,9 +204,6 @@ def stored_bounds(config: Mapping[str, Any], where: object = "shard") -> GraspBo
     """The bounds that the rows of a shard passed, by its ``config``; of shards that tell none, the strict ones with the
     friction that their filter had.
 
-    Args:
-        where: what messages call the shard.
-
     Raises:
         ConfigError: a number that cannot be.
     """

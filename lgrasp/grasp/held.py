@@ -75,7 +75,6 @@ def hold(
     Args:
         q: joint positions [rad or m], (H, K).
         frozen: joints that must not move, (H, K) bool; besides, none moves that is not of the row's space.
-        objects: the n objects that every row holds.
         pose: their poses in the hand frame, internal frames, device poses (H, n, 7).
         tries: candidates that continue each row.
         spaces: opposition spaces, each with a contact surface of the hand. space: that of each row, (H,).

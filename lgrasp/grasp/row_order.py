@@ -14,7 +14,6 @@ class RowOrder:
     """The order of the rows of one shard.
 
     Args:
-        seed: base seed.
         block: candidates of a block.
     """
 

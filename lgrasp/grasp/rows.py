@@ -47,7 +47,6 @@ def grasp_rows(
     Args:
         center: origin of the object's internal frame in the user's [m], (3,) f32.
         extra: further metrics, (N,) each.
-        protocol: of the verdicts, if the table has some.
     """
     postures, contacts = ({n: getattr(table, n)[:, None] for n in names} for names in (POSTURES, CONTACTS))
     columns = step_columns(tree, postures, table.pose[:, None], contacts, center[None])

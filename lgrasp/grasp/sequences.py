@@ -95,7 +95,6 @@ def extend(
     """Sequences that are one step longer: joints that the step may not move stay exactly as they were.
 
     Args:
-        before: the sequences that are continued.
         posture: their :meth:`SequenceTable.posture`, (N, K).
         row: row of ``before`` of each grasp, (M,).
         space: opposition space of the step, (M,).

@@ -60,8 +60,6 @@ def primitive_wrenches(
         normals: Unit normals into the object, shape [k, 3].
         center: Point that torques are taken about, the object's centre of mass [m], shape [3].
         radius: Length that torques are divided by, the object's largest distance from there [m].
-        friction: Coefficient of friction.
-        edges: Edges of each friction pyramid.
     """
     forces = cone_edges(normals, friction=friction, edges=edges)
     torques = np.cross((points - center)[:, None], forces) / radius
@@ -91,7 +89,6 @@ def wrench_spaces(
         normals: Normals into the object, shape [n, c, 3], NaN where there is no contact.
         center: The object's centre of mass [m], shape [3].
         radius: The object's largest distance from there [m].
-        friction: Coefficient of friction.
     """
     out = np.zeros((len(points), 2))
     for i in range(len(points)):

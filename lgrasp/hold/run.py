@@ -66,7 +66,6 @@ class HoldTester:
 
     Args:
         hand, obj: on one device.
-        test: how often, and with what numbers.
         others: what the object may be as well: draws take it and these in turn; the first trial is of the object.
     """
 

@@ -37,8 +37,6 @@ def try_rows(
     Args:
         hand, obj: on one device.
         seed: of the run that the rows are of.
-        workers: threads, on the CPU.
-        progress: called with rows done.
     """
     poses, tester = _control_poses(rows, hand, obj), HoldTester(hand, obj, test)
     out = {name: np.zeros(len(rows), np.float32) for name in METRICS}

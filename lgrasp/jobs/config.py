@@ -219,7 +219,6 @@ def pair_requests(
 
     Args:
         protocol: that of ``--simulate``, which the pipeline has already.
-        shared: other fields of the requests.
 
     Raises:
         ConfigError: a value out of range, or two pairs with the same folder.

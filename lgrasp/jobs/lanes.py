@@ -26,9 +26,7 @@ class Lanes(ExitStack):
 
     Args:
         devices: one lane each.
-        jobs: in order.
         arrays: of each job the task that the lanes share.
-        cache: of all of them.
         resume: keep whole parts of the same run.
     """
 

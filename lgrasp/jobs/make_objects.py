@@ -27,7 +27,6 @@ def make_objects(
     Args:
         kinds: none: all.
         size: range of the longest side, such as ``0.04:0.12`` [m].
-        progress: called with how many are done.
 
     Raises:
         ConfigError: no such range.

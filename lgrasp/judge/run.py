@@ -38,7 +38,6 @@ def judge(
         urdf: original URDF in place of the stored one; its meshes are looked up beside it.
         mesh: original object mesh in place of the stored one (times the stored scale), or meshes by object id.
         rows: judge only this many rows, drawn at random with a fixed seed; duplicates and poses are of all rows.
-        progress: called with rows done and rows to do.
 
     Raises:
         JudgeError: nothing to judge, or a file that cannot be judged.

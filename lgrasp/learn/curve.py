@@ -19,8 +19,6 @@ class LossCurve:
     """Keeps the losses of a training that tells them as (step, loss).
 
     Args:
-        steps: of the training.
-        told: is told the same.
         turn: steps after which all objects had theirs; stretches are whole turns.
     """
 

@@ -57,8 +57,6 @@ def make_examples(
     Args:
         T_hand_object: of each grasp as in a shard, x y z [m] qw qx qy qz, (G, 7).
         q: actuated joints [rad or m], (G, K).
-        clouds: how many clouds.
-        device: Warp device of the cameras.
     """
     T = np.linalg.inv(pose_matrix(T_hand_object.astype(float)))
     R, t = T[:, :3, :3], T[:, :3, 3] - model.center

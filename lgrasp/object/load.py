@@ -64,7 +64,6 @@ def load_mesh(
     Args:
         source: Path of a mesh file (see ``MESH_SUFFIXES``), or a ``trimesh.Trimesh``.
         scale: Factor from the file's unit to metres.
-        params: Limits of extents and holes.
 
     Raises:
         ObjectError: The file is missing or unreadable, or the mesh is empty, flat, not finite or of an unlikely size.

@@ -27,10 +27,7 @@ def preprocess_object(
     """Mesh to ObjectModel; the same input gives the same bytes on one type of device.
 
     Args:
-        path_or_mesh: Mesh file or trimesh.
         scale: Factor from the file's unit to metres.
-        params: Sampling, mask and grid parameters.
-        device: Warp device that answers the geometric queries.
 
     Raises:
         ObjectError: The mesh cannot be used; the message names the file, the value and what is accepted.

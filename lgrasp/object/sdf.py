@@ -53,7 +53,6 @@ def build_sdf(
         max_cells: Upper bound of the number of nodes.
         min_cell: Lower bound of the spacing [m].
         pad: Margin around the bounding box [m], at least three cells.
-        device: Warp device of the queries.
     """
     origin, cell, dims = _layout(vertices, max_cells, min_cell, pad)
     corners = _split(vertices[faces].astype(np.float32), _SPLIT_CELLS * cell)

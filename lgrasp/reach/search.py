@@ -61,7 +61,6 @@ class ArmSearch:
         """Joints for targets.
 
         Args:
-            workers: threads.
             progress: called with targets done and reached.
         """
         threads = torch.get_num_threads()

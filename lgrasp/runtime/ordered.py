@@ -17,9 +17,7 @@ def in_order(
     Closing the generator (or an error in an item) drops the items not started and waits for the others.
 
     Args:
-        work: makes the result of an item.
         items: taken as there is room for them; None: there is none until the next result is out.
-        at_once: threads.
         ahead: items that wait for a free thread.
     """
     rest = iter(items)

@@ -79,7 +79,6 @@ def assemble(
     """The MjSpec of a hand with some objects; the drives are as stiff as the object needs that needs the stiffest.
 
     Args:
-        mujoco: the module.
         objects: one may be there twice.
         held: joints above the base link and where they are welded [rad or m].
 

@@ -45,9 +45,6 @@ class DrakeWorld(World):
     Friction has no torsional term: contact patches resist twists by their area. Joints that one drive moves are
     coupled by a constraint.
 
-    Args:
-        model: O objects in the order of the rows.
-
     Raises:
         PhysicsError: Drake is missing or refuses a body; its reason is in the message.
     """

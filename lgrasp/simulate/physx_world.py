@@ -79,9 +79,6 @@ class PhysxWorld(World):
 
     Contacts are hard; friction acts at the points of a contact patch without torsional term, and joints that one drive
     moves share it and are held to their mean.
-
-    Args:
-        model: O objects in the order of the rows.
     """
 
     def __init__(self, model: Model) -> None:

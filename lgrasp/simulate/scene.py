@@ -40,7 +40,6 @@ def scene_of(
 
     Args:
         decompose: cuts dented meshes, perhaps with a cache (:func:`lgrasp.geometry.decompose.decompose`).
-        device: answers the geometric queries.
 
     Raises:
         ShardError: a mesh of the hand is missing.

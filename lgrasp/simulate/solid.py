@@ -61,7 +61,6 @@ def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, devi
 
     Args:
         decompose: cuts the mesh, perhaps with a cache.
-        device: answers the geometric queries.
 
     Raises:
         PhysicsError: a point cloud.

@@ -84,8 +84,6 @@ class Soak:
         folder: exists and is empty.
         kernels: folder of compiled kernels, which is copied if it is there; those that are missing are compiled.
         cache: folder of a cache whose hands, objects and fields commands begin with; none: the first ones make theirs.
-        launch: starts commands.
-        say: called with lines of progress.
     """
 
     def __init__(
@@ -216,9 +214,7 @@ def soak(
     Args:
         commands: keys of :data:`COMMANDS`.
         ways: keys of :data:`WAYS`.
-        rounds: how often.
         hours: go on until so much time has passed, however many rounds that takes.
-        seed: of the moments.
 
     Raises:
         LgraspError: an unknown name, or a command that fails without being disturbed.

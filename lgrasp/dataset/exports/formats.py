@@ -99,17 +99,14 @@ def export_shards(
     appears whole; ``export.json`` is the last.
 
     Args:
-        paths: Shard files or folders of them.
         out: Folder to write; it must be empty or not exist yet.
         to: A key of :data:`FORMATS`.
         where: Conditions on columns that a row must satisfy, all of them, such as ``physics/fc_holds`` or
             ``metrics/epsilon > 0.01``.
-        limit: Most rows.
         split: File of ``lgrasp dataset split``, whose parts become files of their own (webdataset).
         licence: Of the data set, by its SPDX identifier; with it the folder also has what publishing takes: a card
             (``README.md``), ``provenance.json`` and ``SHA256SUMS``.
         cut: Convex pieces of an object, for formats that simulate; without it the hull of its mesh collides.
-        advance: Called with rows done and rows in all.
         run_key: Of the shards and options, to tell a later run that the export, whole or not, is its own; without it an
             export that was interrupted cannot be gone on with.
         replaces: A whole export that the folder holds goes when the first file of this one is written.

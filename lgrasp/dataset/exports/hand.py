@@ -23,10 +23,6 @@ def hand_files(hand: HandRecord, where: Path) -> dict[str, bytes]:
 
     A shard keeps collision meshes only. A link whose visual meshes it lacks shows its collision geometry.
 
-    Args:
-        hand: The hand of a shard.
-        where: The shard, for messages.
-
     Raises:
         ShardError: The shard lacks a collision mesh.
         HandError: The URDF is not XML.
@@ -69,7 +65,6 @@ class HandFrames:
     """Frames and couplings of a URDF.
 
     Args:
-        urdf: The URDF text.
         base_link: Link whose frame poses are given in; None for the root.
         joint_names: Joints in the order of q, length K.
         where: The file that it is from, for messages.

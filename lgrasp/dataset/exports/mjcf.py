@@ -119,7 +119,6 @@ class MjcfScene:
 
     Args:
         hand: ``hand/hand.urdf`` and the meshes it names, by their path in the export.
-        frames: The hand.
         objects: The objects, in the order of the row.
 
     Raises:
@@ -223,8 +222,6 @@ class MjcfWriter:
     """Writes ``grasps/NUMBER.xml`` for every row, numbered over the whole export.
 
     Args:
-        selection: Rows of one or several objects.
-        frames: The selection's hand.
         cut: Convex pieces of an object; without it the hull of its mesh collides.
 
     Raises:

@@ -104,11 +104,9 @@ class ExportFolder:
         """Take up n grasps of one object.
 
         Args:
-            where: For messages.
             names: Joints in the order of ``q``.
             q: Joints [rad or m] at the grasp, before closing, and as targets that press, n x 3 x K numbers.
             pose: Root link (or base link, see :meth:`grasps`) in the object's frame, x y z [m] qw qx qy qz, n x 7.
-            code: Of the object.
             scale: Factor from its mesh to metres as grasped.
 
         Raises:

@@ -186,8 +186,6 @@ def select_rows(
         paths: Shard files, or folders of any depth; in these, shards that cannot be taken are left out with a notice.
         where: Conditions that a row must satisfy, all of them.
         limit: Most rows, counted over all shards in the order given.
-        single: Insist on one object in every row.
-        split: Tells which part each row is in.
 
     Raises:
         ShardError: A shard cannot be read, holds what is in no part, hands differ, no row is left, or a row holds

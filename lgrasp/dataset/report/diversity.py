@@ -118,9 +118,6 @@ class GraspSpread:
     **Joint entropy**, as DexGraspNet proposed it and the evaluation of DGTR computes it: the range of each joint is cut
     into 100 even bins; the entropy of the shares of the rows in them is ``-sum p log p`` with the natural logarithm, 0
     to log 100 = 4.61. Its mean over the joints, and their standard deviation. Joints that are held fixed do not count.
-
-    Args:
-        locked: names of joints that are held fixed.
     """
 
     def __init__(self, hand: HandRecord, locked: Collection[str] = ()) -> None:

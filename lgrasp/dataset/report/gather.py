@@ -149,11 +149,7 @@ class ObjectRows:
 
 
 class HandRows:
-    """All rows of one hand; near-duplicates are looked for on a device of Warp, if one is named.
-
-    Args:
-        locked: names of joints that are held fixed.
-    """
+    """All rows of one hand; near-duplicates are looked for on a device of Warp, if one is named."""
 
     def __init__(self, hand: HandRecord, device: str | None, locked: Collection[str] = ()) -> None:
         k = len(hand.joint_names)

@@ -31,11 +31,7 @@ from lgrasp.words import number, plural
 
 
 def page(numbers: dict[str, Any], hands: Mapping[tuple[str, str], HandRows], pictures: Sequence[Block] = ()) -> str:
-    """The page of the numbers of a report, and of the hands that they were made of, for the samples.
-
-    Args:
-        pictures: some of the rows.
-    """
+    """The page of the numbers of a report, and of the hands that they were made of, for the samples."""
     objects = [" + ".join(group["objects"]) for hand in numbers["hands"] for group in hand["objects"]]
     names = [hand["hand"] for hand in numbers["hands"]]
     what = names[0] if len(names) == 1 else f"{len(names)} hands"

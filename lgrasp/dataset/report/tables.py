@@ -22,10 +22,8 @@ def table(
     """A table.
 
     Args:
-        columns: Their heads.
         rows: Cells as texts; one that begins with ``!`` is marked as bad.
         groups: Heads above the columns, each with how many it spans.
-        caption: What it shows.
         text: Columns of words besides the first.
         total: Whether the last row sums up.
     """

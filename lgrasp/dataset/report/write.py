@@ -31,7 +31,6 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
 
     Args:
         paths: Shard files, or folders that hold some at any depth; of several hands and objects if need be.
-        out: The HTML file.
         progress: Called with (rows done, rows in all) now and then.
 
     Returns:
@@ -70,9 +69,6 @@ def read_dataset(
     Shards are read once, some thousand rows at a time; of the rows stay counts, an even sample of at most 50,000 per
     hand for the scatter plots, and poses and joints of one hand with one object at a time to find near-duplicates (some
     200 bytes a row, at most two million rows), on a GPU if there is one.
-
-    Args:
-        near: look for near-duplicates.
 
     Raises:
         ShardError: No shard is found, or one cannot be read.

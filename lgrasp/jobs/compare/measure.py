@@ -65,7 +65,6 @@ def measure_hand(cells: Mapping[str, Mapping[str, Any]], files: Sequence[Path]) 
 
     Args:
         cells: by object, see :func:`measure_cell`.
-        files: their shards.
     """
     found: dict[str, Any] = {"rows": sum(cell["rows"] for cell in cells.values())}
     for name in MEANS:

@@ -97,7 +97,6 @@ def check_hand(
 
     Args:
         hand: name, folder, URDF or hand of an installed package.
-        events: told what is being done.
 
     Raises:
         LgraspError: the hand cannot be used, or ``out`` cannot be written.

@@ -137,7 +137,6 @@ def evaluate(
     Args:
         clouds: of each object and kind. starts: of each cloud.
         out: folder for the plans as rows of the meshes, for the simulator, by kind.
-        overwrite: replace plans that are there.
 
     Returns:
         ``hand``, ``unknown`` (objects that it was not trained on), ``kinds``, ``seconds``.

@@ -74,7 +74,6 @@ def move_rows(
         keep_invalid: those rows are kept too, refined, with their own metrics, ``valid`` 0 and ``failed_bound``.
         stored: contacts of the rows are known, and rows that are not replaced stay as they are.
         measured: the rows, their control poses and metrics, are of these bounds.
-        progress: called with rows done.
     """
     refiner = Refiner(hand.model, obj, params, device=hand.device)
     arrays = upload_object(obj, hand.device, planes)

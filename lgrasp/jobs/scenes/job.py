@@ -145,9 +145,6 @@ def describe_scenes(paths: Sequence[Path]) -> dict[str, Any]:
 def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Events) -> Stock:
     """Find the grasps, or generate them into the folder ``grasps`` of the scenes, and load everything.
 
-    Args:
-        events: told what is being loaded.
-
     Raises:
         ConfigError: no objects, or shards of another hand or without an object that is asked for.
         LgraspError: hand, objects or shards cannot be used.

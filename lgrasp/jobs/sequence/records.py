@@ -26,7 +26,6 @@ def sequence_rows(
 
     Args:
         levels: rows of ever more objects; parents are rows of the level before.
-        protocol: of the verdicts, if there are any.
         objects: slots of a row; 0: as many as there are levels.
     """
     slots = objects or len(levels)

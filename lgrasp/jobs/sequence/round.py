@@ -80,7 +80,6 @@ def run_round(
     What becomes of a sequence does not depend on those after it: begun with fewer, a round has the first of its rows.
 
     Args:
-        workers: threads.
         tell: called with the share of the round that is done; what it raises ends the round.
         verdicts: simulates the rows of each step; only those that hold are continued.
         begun: sequences that are started; None: the pipeline's width.

@@ -71,7 +71,6 @@ def make_sequences(
         workers: threads; they do not change the rows.
         progress: called with (sequences so far, how many more the work on the running round is worth); what it raises
             ends the shard.
-        verdicts: see :func:`run_round`.
     """
     result = SequenceResult()
     objects, width = len(inputs.objects), pipeline.params("sequence").width

@@ -45,7 +45,6 @@ class DiffuserNet(nn.Module):
 
     Args:
         lower, upper: joint limits [rad or m], (K,).
-        spaces: how many opposition spaces there are.
         basis: points around the object, (B, 3); held_basis: in the hand frame, (H, 3) [m].
         senses: points of the hand's surface (:func:`~lgrasp.learn.diffuser.senses.sense_points`), (P, 4).
     """
