@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -22,6 +22,9 @@ from lgrasp.grasp.schema import (
     DatasetSpec,
 )
 from lgrasp.paths import name_problem
+
+Members = Mapping[str, Any]
+"""The :func:`members` of a file."""
 
 _MOST_GROUPS = 8  # inside each other
 _EXPANSION = 2000  # declared over stored bytes; the compression of HDF5 ends at about 1000
@@ -123,12 +126,8 @@ def _foreign_data(dataset: h5py.Dataset) -> str:
     return ""
 
 
-def structure_problems(nodes: Mapping[str, Any]) -> list[str]:
-    """All differences between a file and the schema of shards, one line each; empty when it conforms.
-
-    Args:
-        nodes: :func:`members` of the file.
-    """
+def structure_problems(nodes: Members) -> list[str]:
+    """All differences between a file and the schema of shards, one line each; empty when it conforms."""
     groups = (SEQUENCE_DATASETS, tuple(TABLE_FIELDS.values()))
     found = [spec for group in groups if any(spec.path in nodes for spec in group) for spec in group]
     problems = [
@@ -175,14 +174,8 @@ def _is_part(part: Any) -> bool:
     return all(type(part.get(name)) is int and part[name] >= 0 for name in ("shard_index", "rows"))
 
 
-def schema_problems(
-    nodes: Mapping[str, Any], datasets: Sequence[DatasetSpec], attributes: Sequence[AttributeSpec]
-) -> list[str]:
-    """Differences between a file's datasets and attributes and those of a format, one line each.
-
-    Args:
-        nodes: :func:`members` of the file.
-    """
+def schema_problems(nodes: Members, datasets: Sequence[DatasetSpec], attributes: Sequence[AttributeSpec]) -> list[str]:
+    """Differences between a file's datasets and attributes and those of a format, one line each."""
     problems: list[str] = []
     dims: dict[str, int] = {}
     for spec in datasets:
@@ -196,12 +189,8 @@ def schema_problems(
     return problems
 
 
-def expand(nodes: Iterable[str], pattern: str) -> list[str]:
-    """The concrete paths of a schema path: ``*`` becomes each member of the group it is in, sorted.
-
-    Args:
-        nodes: paths of a file's :func:`members`.
-    """
+def expand(nodes: Members, pattern: str) -> list[str]:
+    """The concrete paths of a schema path: ``*`` becomes each member of the group it is in, sorted."""
     head, star, tail = pattern.partition("*")
     if not star:
         return [pattern]
@@ -269,14 +258,11 @@ _KINDS = {
 """Kinds of attributes: what to call one; kinds of NumPy dtypes, or what reads it, or fails, or gives None."""
 
 
-def text_sha256(nodes: Mapping[str, Any]) -> str:
+def text_sha256(nodes: Members) -> str:
     """SHA-256 over every attribute (except ``text_sha256``) and every scalar string, which have no HDF5 checksum.
 
     The hash is of the JSON object, sorted keys, no spaces, ASCII escapes, that maps ``path@name`` to an attribute's
     value and ``path`` to a scalar string dataset's text; paths have no leading slash.
-
-    Args:
-        nodes: :func:`members` of the file.
     """
     texts: dict[str, Any] = {}
     for path, node in nodes.items():
@@ -289,12 +275,8 @@ def text_sha256(nodes: Mapping[str, Any]) -> str:
     return hashlib.sha256(document.encode()).hexdigest()
 
 
-def changed_texts(file: h5py.File, nodes: Mapping[str, Any]) -> list[str]:
-    """The problem that attributes or texts of a file were changed, if they were; one without the checksum has none.
-
-    Args:
-        nodes: :func:`members` of the file.
-    """
+def changed_texts(file: h5py.File, nodes: Members) -> list[str]:
+    """The problem that attributes or texts of a file were changed, if they were; one without the checksum has none."""
     if "text_sha256" not in file.attrs or file.attrs["text_sha256"] == text_sha256(nodes):
         return []
     changed = "/: attributes or texts were changed after writing (text_sha256 differs)"
