@@ -7,6 +7,7 @@ import numpy as np
 from lgrasp.errors import HandError
 from lgrasp.hand.spec import HandSpec, OppositionSpace
 from lgrasp.hand.tree import Tree
+from lgrasp.math.constants import LIMIT_EXCESS
 from lgrasp.math.limits import MAX_BODIES, MAX_DOFS, MAX_JOINTS
 
 
@@ -24,6 +25,26 @@ def check_size(spec: HandSpec, tree: Tree) -> None:
             f"hand '{spec.name}': one dependency group has {joints} joints and {dofs} drives, at most {MAX_JOINTS} and "
             f"{MAX_DOFS} are supported; lock the joint that moves several fingers (hand.yaml: locked)"
         )
+
+
+def open_posture_notes(spec: HandSpec, tree: Tree) -> list[str]:
+    """Values of the open posture that are not taken as they are: outside limits, or of joints that are
+    not driven."""
+    limits = dict(zip(tree.joint_names, zip(tree.joint_lower, tree.joint_upper, strict=True), strict=True))
+    notes = []
+    for name, value in spec.open_posture.items():
+        if name not in limits:
+            notes.append(
+                f"open_posture: '{name}' = {value:g} counts for nothing, the joint is locked or mimics another"
+            )
+            continue
+        lower, upper = map(float, limits[name])
+        if not lower - LIMIT_EXCESS <= value <= upper + LIMIT_EXCESS:
+            taken = min(max(value, lower), upper)
+            notes.append(
+                f"open_posture: '{name}' = {value:g} is outside [{lower:g}, {upper:g}] and counts as {taken:g}"
+            )
+    return notes
 
 
 def check_contact_links(spec: HandSpec, link_names: tuple[str, ...], geometry: dict[str, object]) -> None:

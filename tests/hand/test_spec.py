@@ -16,7 +16,7 @@ from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import find_hand
 from lgrasp.hand.names import known_hands
 from lgrasp.hand.spec import HandSpec, load_spec
-from lgrasp.hand.spec_check import check_contact_links
+from lgrasp.hand.spec_check import check_contact_links, open_posture_notes
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 
@@ -230,3 +230,15 @@ def test_hand_without_solids(tmp_path):
 def test_a_hand_is_found_without_drafting():
     code = "from lgrasp.jobs.hands import hand_source; hand_source('allegro')"
     assert loaded(code, ["lgrasp.hand.drafting"]) == []
+
+
+def test_values_of_the_open_posture_that_are_not_taken_are_told():
+    source = find_hand("barrett")
+    tree = build_tree(read_urdf(source.urdf), source.spec)
+    assert open_posture_notes(source.spec, tree) == []
+    follower = next(j.name for j in read_urdf(source.urdf).joints if j.mimic)
+    spec = source.spec.model_copy(update={"open_posture": {"finger_1_med_joint": -30.0, follower: 0.0}})
+    assert open_posture_notes(spec, tree) == [
+        "open_posture: 'finger_1_med_joint' = -30 is outside [-2.44, 0] and counts as -2.44",
+        f"open_posture: '{follower}' = 0 counts for nothing, the joint is locked or mimics another",
+    ]

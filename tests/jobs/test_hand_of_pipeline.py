@@ -1,14 +1,25 @@
 """What a pipeline asks for that a hand cannot give."""
 
+import shutil
+
 import pytest
 
 from lgrasp.engine.pipeline import load_pipeline
+from lgrasp.hand.find import find_hand
 from lgrasp.jobs.hands import for_hand
 
 
 def test_more_contacts_than_a_hand_has_fingers_are_told(said):
     for_hand(load_pipeline("robust").with_params("search", contacts=(5,)), "allegro")
     assert said == ["hand 'allegro': search.contacts is 4, not 5: its fingers"]
+
+
+def test_more_contacts_than_fingers_in_the_rules_of_the_hand_are_told(said, tmp_path):
+    rules = (find_hand("allegro").urdf.parent / "hand.yaml").read_text()
+    (tmp_path / "hand.yaml").write_text(f"{rules}\ncontacts: [9]\n")
+    shutil.copy(find_hand("allegro").urdf, tmp_path)
+    for_hand(load_pipeline("robust"), str(tmp_path))
+    assert said == ["hand 'allegro': contacts is 4, not 9: its fingers"]
 
 
 @pytest.mark.parametrize("asked", [(2, 5), (4,)])

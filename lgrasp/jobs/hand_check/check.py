@@ -20,6 +20,7 @@ from lgrasp.files import temporary_folder, write_file
 from lgrasp.hand.fingers import finger_label
 from lgrasp.hand.opposition.facing import space_opening, space_postures
 from lgrasp.hand.opposition.spaces import hand_spaces, longest, space_sides
+from lgrasp.hand.spec_check import open_posture_notes
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.hand_check.diagnose import diagnose, hand_findings
@@ -61,7 +62,7 @@ class HandCheck:
 
     hand: str
     note: str  # where the rules come from
-    notes: list[str]  # of the collision model
+    notes: list[str]  # of the open posture and the collision model
     hints: list[str]  # what the rules leave unused, though enough came out
     objects: list[ObjectCheck]
     spaces: list[SpaceCheck]
@@ -131,7 +132,8 @@ def check_hand(
     drawn = [draw(inputs, out / f"{name}.png") for name, draw in drawers.items()]
     if able := [space.name for space in spaces if all(space.areas)]:
         drawn.append(draw_spaces(inputs, able, out / "spaces.png"))
-    return HandCheck(model.name, source.note, list(model.notes), hints, checks, spaces, sequence, drawn + pictures)
+    notes = [*open_posture_notes(source.spec, model.tree), *model.notes]
+    return HandCheck(model.name, source.note, notes, hints, checks, spaces, sequence, drawn + pictures)
 
 
 def check_spaces(inputs: Inputs) -> list[SpaceCheck]:
