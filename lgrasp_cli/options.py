@@ -93,11 +93,8 @@ def split(names: str) -> tuple[str, ...]:
 
 
 def open_cache(folder: Path | None, *, fresh: bool = False) -> "Cache":
-    """The cache of this command; compiled kernels go to the same folder.
-
-    Args:
-        fresh: make every entry again.
-    """
+    """The cache of this command, whose entries are all made again if ``fresh``; compiled kernels go to the same
+    folder."""
     import os
 
     if folder is not None:

@@ -19,11 +19,7 @@ _NEEDLESS = {"--resume": "--overwrite"}  # what commands with another option do 
 
 
 def renew(arguments: list[str], options: Set[str]) -> list[str]:
-    """The words of a command line, options by their names of this release.
-
-    Args:
-        options: names of those that the command has.
-    """
+    """The words of a command line, options by their names of this release, of those that the command has."""
     out = []
     for word, after in zip_longest(arguments, arguments[1:]):
         old, sign, value = word.partition("=")

@@ -88,11 +88,8 @@ def folders_below(paths: Paths, *, deep: bool = True) -> list[Path]:
 
 
 def walk(top: Path, *, hidden: bool = True) -> Iterator[tuple[Path, list[str]]]:
-    """A folder and those below it, each once, with the names of their files. Links to folders elsewhere are followed.
-
-    Args:
-        hidden: Folders too whose names begin with a dot.
-    """
+    """A folder and those below it, each once, with the names of their files; ``hidden``: also those whose names begin
+    with a dot. Links to folders elsewhere are followed."""
     real, seen = top.resolve(), set()
 
     def is_new(folder: Path) -> bool:

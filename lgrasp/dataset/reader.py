@@ -93,11 +93,7 @@ class FileReader:
         return [path.removeprefix("objects/") for path in expand(self._nodes, "objects/*")]
 
     def hand(self, *, check: bool = True) -> HandRecord:
-        """The hand, with its mesh files.
-
-        Args:
-            check: Refuse values that violate the format.
-        """
+        """The hand, with its mesh files; ``check``: refuse values that violate the format."""
         with reading(self.path):
             nodes, attrs = self._nodes, self.attributes
             blobs = [nodes[path] for path in sorted(expand(nodes, "hand/meshes/*"), key=lambda n: (len(n), n))]

@@ -138,11 +138,7 @@ def _object_key(path: Path, content: str, scale: float, params: ObjectParams) ->
 
 
 class Loader:
-    """Hands, objects and fields from the cache, or made and cached.
-
-    Args:
-        report: called with (what, share done).
-    """
+    """Hands, objects and fields from the cache, or made and cached; ``report`` is called with (what, share done)."""
 
     def __init__(self, cache: Cache, device: str = "cpu", report: Report | None = None) -> None:
         self.cache, self.device = cache, device

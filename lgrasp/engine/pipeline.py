@@ -127,11 +127,8 @@ class Pipeline(_Head):
         return self.model_copy(update={"stages": stages})
 
     def suited(self, joints: float) -> "Pipeline":
-        """A copy with one of stages ik, adjust and close where it is open to hands.
-
-        Args:
-            joints: of its own that a finger of the hand has on the mean.
-        """
+        """A copy with one of stages ik, adjust and close where it is open to hands, by how many joints of its own a
+        finger of the hand has on the mean."""
         if not self.open_to_hands:
             return self
         if "close" in self.order:

@@ -160,11 +160,7 @@ class Job(Request, ABC):
         return True
 
     def load(self, events: Events, missing: bool) -> None:
-        """Load the inputs of the parts onto ``self.device_used``.
-
-        Args:
-            missing: are there parts to make?
-        """
+        """Load the inputs of the parts onto ``self.device_used``; ``missing``: there are parts to make."""
 
     @abstractmethod
     def make(self, part: Part, progress: PartProgress) -> Made:

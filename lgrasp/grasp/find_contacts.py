@@ -53,11 +53,7 @@ def find_contacts(
 
 
 def palmar_runs(hand: HandArrays, side: ContactSurface, at: np.ndarray | None = None) -> PalmarRuns:
-    """A palmar side on the device of its hand.
-
-    Args:
-        at: those of the points that are meant, (n,); default: all.
-    """
+    """A palmar side, or the points ``at`` of it (n,), on the device of its hand."""
     at = np.arange(len(side.link)) if at is None else at
     side = ContactSurface(*(values[at] for values in side))
     first, known = _runs(side.link), {int(x): k for k, x in enumerate(hand.model.grid_link)}

@@ -91,11 +91,8 @@ def bounds_squeeze(bounds: Any) -> bool:
 
 
 def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
-    """Which of n rows fail each of _SQUEEZE_BOUNDS, (n,) bool, in its order.
-
-    Args:
-        bounds: GraspBounds, or the same numbers on a device.
-    """
+    """Which of n rows fail each of _SQUEEZE_BOUNDS (GraspBounds, or the same numbers on a device), (n,) bool, in its
+    order."""
     pinch = (table.contact_links >= 0).sum(1) == int(PINCH)
     return [
         table.metrics["squeeze_travel"] < bounds.min_squeeze_travel,

@@ -11,11 +11,7 @@ _GAMMA = np.array([0x9E3779B97F4A7C15], np.uint64)
 
 
 class RowOrder:
-    """The order of the rows of one shard.
-
-    Args:
-        block: candidates of a block.
-    """
+    """The order of the rows of one shard, whose blocks have ``block`` candidates."""
 
     def __init__(self, seed: int, shard: int, block: int) -> None:
         self._seed = stage_seed(seed, shard, "rows") * _GAMMA

@@ -19,11 +19,7 @@ _STEPS = (
 
 
 def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
-    """The stage with the smallest share of survivors and a sentence on it.
-
-    Args:
-        counts: survivors per stage as the stages report them.
-    """
+    """The stage with the smallest share of survivors, by the ``counts`` of stages, and a sentence on it."""
     worst, least, words = "place", 2.0, "nothing was tried"
     for stage, before, after, reason in _STEPS:
         found = counts.get(stage)

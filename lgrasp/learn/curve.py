@@ -16,11 +16,8 @@ Curves = Mapping[str, Mapping[str, list[list[float]]]]
 
 
 class LossCurve:
-    """Keeps the losses of a training that tells them as (step, loss).
-
-    Args:
-        turn: steps after which all objects had theirs; stretches are whole turns.
-    """
+    """Keeps losses that a training tells as (step, loss), in stretches of whole turns: ``turn`` steps, one for each
+    object."""
 
     def __init__(self, steps: int, told: Callable[[int, float], None] | None = None, *, turn: int = 1) -> None:
         self.points: list[list[float]] = []

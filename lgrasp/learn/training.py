@@ -149,11 +149,7 @@ class Measured(NamedTuple):
 
 
 def measure(trainer: Trainer, examples: Sequence[Examples], *, rounds: Sequence[int] = ()) -> Measured:
-    """Energies of the best answers for clouds.
-
-    Args:
-        rounds: numbers of rounds of the refiner.
-    """
+    """Energies of the best answers for clouds, and after so many ``rounds`` of the refiner."""
     parts: list[torch.Tensor] = []
     for e in examples:
         coarse, refiner = trainer.predict(e, ANSWERS), trainer.refiner(e)

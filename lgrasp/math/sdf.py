@@ -28,11 +28,7 @@ class Sdf:
 
 
 def block_minima(values: np.ndarray) -> np.ndarray:
-    """Least value in each block of BLOCK cells a side, flat.
-
-    Args:
-        values: at the nodes of a grid, (nx, ny, nz).
-    """
+    """Least value in each block of BLOCK cells a side of a grid (nx, ny, nz), flat."""
     for axis, nodes in enumerate(values.shape):
         first = np.arange(0, nodes - 1, BLOCK)
         at = np.minimum(first[:, None] + np.arange(BLOCK + 1), nodes - 1)

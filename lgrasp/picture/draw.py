@@ -107,11 +107,8 @@ def framing(points: np.ndarray, way: np.ndarray) -> np.ndarray:
 
 
 def draw(painted: Sequence[Painted], dots: np.ndarray, view: Viewpoint) -> np.ndarray:
-    """What a camera sees, white behind all: sRGB, shape (h, w, 3), uint8.
-
-    Args:
-        dots: points that are seen through everything [m], shape (n, 3).
-    """
+    """What a camera sees, white behind all: sRGB, shape (h, w, 3), uint8; ``dots`` [m], shape (n, 3), show through
+    everything."""
     start()
     intrinsics = view.intrinsics
     with wp.ScopedDevice("cpu"):

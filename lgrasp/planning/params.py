@@ -105,11 +105,8 @@ class PlanParams(Params):
     bounds: GraspBounds = Field(default=_PLAN_BOUNDS, description="What a plan must satisfy.")
 
     def effort(self, fingers: int | None, unsure: bool = False) -> Effort:
-        """For hands with so many fingers that a network draws, or open ones (None).
-
-        Args:
-            unsure: what the object is, as a camera saw one side of it.
-        """
+        """For hands with so many fingers that a network draws, or open ones (None); ``unsure``: a camera saw one side
+        of it."""
         own: dict[str, Any] = {"draws": 1, "finalists": 10, "tried": 10}
         own["matching_rounds"] = self.search.matching_rounds
         own["min_hold_probability"] = least = self.bounds.min_hold_probability

@@ -58,11 +58,7 @@ class ArmSearch:
     def __call__(
         self, targets: Targets, workers: int = 1, progress: Callable[[int, int], None] = lambda done, reached: None
     ) -> Reached:
-        """Joints for targets.
-
-        Args:
-            progress: called with targets done and reached.
-        """
+        """Joints for targets; ``progress`` is called with targets done and reached."""
         threads = torch.get_num_threads()
 
         def work(first: int) -> Reached:

@@ -31,11 +31,7 @@ class Intrusions(NamedTuple):
 
 
 class LinkSolids:
-    """The links of a hand with their distance grids.
-
-    Args:
-        cloud: points of the object's surface, its internal frame [m], (n, 3).
-    """
+    """The links of a hand with their distance grids, before points of an object, in its internal frame, (n, 3) [m]."""
 
     def __init__(
         self, model: HandModel, cloud: np.ndarray, margin: float, *, dtype: torch.dtype, device: str | torch.device

@@ -201,11 +201,8 @@ class Refiner(nn.Module):
         return pose
 
     def energy(self, R: torch.Tensor, t: torch.Tensor, q: torch.Tensor, *, matches: Matches | None = None) -> Energies:
-        """E* of hands, term by term, differentiable by R, t and q; correspondences are constants.
-
-        Args:
-            matches: default: those of these poses, with the parameters' first reach.
-        """
+        """E* of hands, term by term, differentiable by R, t and q; correspondences are constants: ``matches``, or those
+        of these poses with the parameters' first reach."""
         self._check(R, t, q)
         matches = matches or self.match(R, t, q)
         bodies = self._bodies(q)

@@ -37,11 +37,8 @@ class HandSurface:
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of ``count`` points, each the farthest from those before (all and repeats when there are fewer).
-
-    Args:
-        points: (n, 3), n >= 1.
-    """
+    """Indices of ``count`` of points (n, 3), each the farthest from those before (all and repeats when there are
+    fewer)."""
     chosen, gap = [0], np.full(len(points), np.inf)
     while len(chosen) < min(count, len(points)):
         away = points - points[chosen[-1]]

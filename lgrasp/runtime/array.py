@@ -107,11 +107,8 @@ class Array(NamedTuple):
         return [parts[i] for i in own if (self.before + i) // self.tasks % self.lanes == self.lane]
 
     def check_early(self, number: int | None, what: str) -> None:
-        """As :meth:`share`, of the parts of one job, as far as it can be told before the job is loaded.
-
-        Args:
-            number: parts of the job; None: not known yet.
-        """
+        """As :meth:`share`, of the parts of one job (None: not known yet), as far as can be told before the job is
+        loaded."""
         if number is not None and self.slurm and self.slurm.whole:
             self.resolved().check_busy(number, what)
 

@@ -4,10 +4,6 @@ import warp as wp
 
 
 def running_sums(values: wp.array) -> None:
-    """Replace each number by the sum of all up to it.
-
-    Args:
-        values: (N,) i32.
-    """
+    """Replace each number (N,) i32 by the sum of all up to it."""
     with values.device.context_guard:  # the library scans in the stream of the thread's current context
         wp.utils.array_scan(values, values, inclusive=True)

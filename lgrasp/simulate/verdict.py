@@ -181,11 +181,8 @@ def worst(draws: Sequence[Verdict]) -> Verdict:
 
 
 def moved(pose: np.ndarray, home: np.ndarray) -> np.ndarray:
-    """How far objects are from where they started: displacement [m] and rotation [rad], (..., O, 2).
-
-    Args:
-        pose, home: now and at the start, of their centres of mass (..., O, 7).
-    """
+    """How far objects are from where they started: displacement [m] and rotation [rad], (..., O, 2), by poses of their
+    centres of mass now and at the start (..., O, 7)."""
     now, start = np.asarray(pose, float), np.asarray(home, float)
     norm = np.linalg.norm(now[..., 3:], axis=-1) * np.linalg.norm(start[..., 3:], axis=-1)
     cosine = np.abs((now[..., 3:] * start[..., 3:]).sum(-1)) / np.maximum(norm, 1e-12)

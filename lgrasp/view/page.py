@@ -21,11 +21,7 @@ _PATIENCE = 20.0  # [s] for a browser to draw a picture
 
 
 class Aim:
-    """Where browsers look from: where links, objects and contacts are seen best.
-
-    Args:
-        contacts: [m], shape (c, 3).
-    """
+    """Where browsers look from: where links, objects and contacts [m], shape (c, 3), are seen best."""
 
     def __init__(
         self, links: Sequence[trimesh.Trimesh], objects: Sequence[trimesh.Trimesh], contacts: np.ndarray

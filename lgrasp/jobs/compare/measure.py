@@ -61,11 +61,8 @@ def measure_cell(path: Path, protocol: ProtocolName | None) -> dict[str, Any]:
 
 
 def measure_hand(cells: Mapping[str, Mapping[str, Any]], files: Sequence[Path]) -> dict[str, Any]:
-    """Numbers of a hand with all objects: means over them, and the diversity of all rows together.
-
-    Args:
-        cells: by object, see :func:`measure_cell`.
-    """
+    """Numbers of a hand by the :func:`measure_cell` of objects: means over them, and the diversity of all rows
+    together."""
     found: dict[str, Any] = {"rows": sum(cell["rows"] for cell in cells.values())}
     for name in MEANS:
         known = [cell[name] for cell in cells.values() if cell[name] is not None]

@@ -20,11 +20,8 @@ _EVALUATED, _LOOKED_AT = 16_384, 2048  # steps of sequences at most: after the t
 
 
 class StepTrainer:
-    """A network, the mean of its weights that is kept, and the random numbers of one training.
-
-    Args:
-        unseen: objects that are only evaluated on, (O,) bool.
-    """
+    """A network, the mean of its weights that is kept, and the random numbers of one training, without ``unseen``
+    objects (O,) bool, which are only evaluated on."""
 
     def __init__(
         self,

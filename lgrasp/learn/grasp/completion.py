@@ -84,11 +84,8 @@ def _distances(x: torch.Tensor, points: torch.Tensor, normals: torch.Tensor) -> 
 
 
 class CompletionNet(nn.Module):
-    """A U-Net on cubes; it corrects their first guess, and tells how sure it is.
-
-    Args:
-        channels: at the finest of four levels.
-    """
+    """A U-Net on cubes with ``channels`` at the finest of four levels; it corrects their first guess, and tells how
+    sure it is."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()

@@ -22,11 +22,7 @@ _AT_ONCE = 16  # views
 
 
 class ViewSet:
-    """Views of O objects, V of each one after another, on one device.
-
-    Args:
-        grids: distances of the objects.
-    """
+    """Views of O objects with known distances, V of each one after another, on one device."""
 
     def __init__(self, views: Sequence[CloudView], grids: Sequence[SdfGrid], device: torch.device | str) -> None:
         def put(name: str) -> torch.Tensor:

@@ -35,11 +35,8 @@ class CloudCompletion:
         return completed_grids(completes, points, normals, nodes)[0]
 
     def distance(self, places: np.ndarray, surface: int = LIKELY) -> np.ndarray:
-        """Guessed signed distances [m] of places (n, 3) in the cloud's frame, (n,); positive beyond what is guessed.
-
-        Args:
-            surface: place in SHARES.
-        """
+        """Signed distances [m] from a surface of SHARES that is guessed, of places (n, 3) in the cloud's frame, (n,);
+        positive beyond what is guessed."""
         grid, local = self.grids[surface], (places - self.view.t) @ self.view.R
         beyond = np.linalg.norm(np.maximum(np.abs(local) + float(grid.origin[0]), 0), axis=1)
         found = sample_sdf(grid, local)
@@ -51,11 +48,8 @@ class CloudCompletion:
         return float(np.linalg.norm(self.view.normals.mean(0))) > ONE_SIDED
 
     def completed(self, model: ObjectModel, surface: int = LIKELY) -> ObjectModel:
-        """The model of the cloud, whose internal frame is the cloud's frame here, with the sides that nobody saw.
-
-        Args:
-            surface: place in SHARES.
-        """
+        """The model of the cloud, whose internal frame is the cloud's frame here, with the sides that nobody saw as a
+        surface of SHARES."""
         grid = self.grids[surface]
         inside = (np.argwhere(grid.values < 0) * grid.cell + grid.origin) @ self.view.R.T + self.view.t
         return completed_object(model, lambda x: self.distance(x, surface), inside)

@@ -30,11 +30,8 @@ class SeenSolid(NamedTuple):
 
 
 def random_solid(seed: int, number: int, points: int) -> SeenSolid:
-    """Every second one is of a kind of household things, in turn, the others of free forms; most are deformed.
-
-    Args:
-        points: of each view.
-    """
+    """Every second one is of a kind of household things, in turn, the others of free forms; most are deformed. Each
+    view has so many points."""
     rng, kinds = np.random.default_rng([seed, number]), get_args(ShapeKind)
     mesh = random_shape(seed, number, kinds[number // 2 % len(kinds)] if number % 2 else None)
     if rng.random() < _DEFORMED:
@@ -47,11 +44,8 @@ def random_solid(seed: int, number: int, points: int) -> SeenSolid:
 def random_solids(
     seed: int, count: int, points: int, made: Callable[[int], None] = lambda done: None
 ) -> list[SeenSolid]:
-    """``count`` of them, by as many processes as there are cores; few are made here.
-
-    Args:
-        made: called with how many there are.
-    """
+    """``count`` of them, by as many processes as there are cores; few are made here. ``made`` is told how many there
+    are."""
     solids: list[SeenSolid] = []
 
     def keep(found: Iterable[SeenSolid]) -> list[SeenSolid]:

@@ -34,11 +34,8 @@ def camera(sides: int) -> CameraParams:
 def draw_views(
     vertices: np.ndarray, faces: np.ndarray, count: int, points: int, rng: np.random.Generator, device: str = "cpu"
 ) -> list[CloudView]:
-    """Views of a mesh that is centred: every second from one side, the others from two or from all around in turn.
-
-    Args:
-        points: of each view.
-    """
+    """Views, with so many points each, of a mesh that is centred: every second from one side, the others from two or
+    from all around in turn."""
     sides = [SIDES["one view"], SIDES["full"], SIDES["one view"], SIDES["two views"]]
     clouds = (seen_cloud(vertices, faces, camera(sides[k % 4]), rng, device) for k in range(count))
     return [make_view(cloud.points, cloud.normals, points) for cloud in clouds]

@@ -111,11 +111,8 @@ class GraspEnergy:
     def contact_points(
         self, R: torch.Tensor, t: torch.Tensor, bodies: tuple[torch.Tensor, torch.Tensor], contacts: HandContacts
     ) -> torch.Tensor:
-        """Contact points of the hand in the frame of the object to grasp, (N, 2, 3) [m].
-
-        Args:
-            bodies: what ``kinematics`` gives.
-        """
+        """Contact points of the hand, with the bodies of ``kinematics``, in the frame of the object to grasp, (N, 2, 3)
+        [m]."""
         R_body = torch.take_along_dim(bodies[0], contacts.body[..., None, None], 1)  # (N, 2, 3, 3)
         t_body = torch.take_along_dim(bodies[1], contacts.body[..., None], 1)
         p = (R_body * contacts.point[..., None, :]).sum(-1) + t_body - t[:, None]
