@@ -72,8 +72,8 @@ class Bank:
         )
 
     def load(self, rows: int, *, whole: bool = True) -> Account | None:
-        """The account (if ``whole``, of a finished shard, too), or None if a shard of ``rows`` rows cannot continue from
-        any; damage is reported."""
+        """The account (if ``whole``, of a finished shard, too), or None if a shard of ``rows`` rows cannot continue
+        from any; damage is reported."""
         arrays = self.cache.load("bank", self.key)
         if arrays is None:
             return None
