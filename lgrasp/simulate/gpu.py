@@ -3,6 +3,7 @@
 import math
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,6 +19,8 @@ from lgrasp.simulate.worlds import Kept, Placed, Sighting, Worlds
 
 _SHARES = (4.0, 2.0, 1.0, 0.5, 0.25, 0.0625)
 """Worlds in which closed hands are pulled, over those in which they close: fewer and fewer, as directions end."""
+_FEW_PER_THREAD = 4
+"""Directions for each thread of the CPU, which ends the last: a GPU steps a few worlds no faster than thousands."""
 _WORLD_BYTES = 3.0e5
 """Of a GPU's memory, that a world takes for each object."""
 _MOST_HANDS, _LEAST_HANDS = 8192, 256
@@ -58,16 +61,19 @@ class WorldTrials:
     Args:
         device: Warp device.
         worlds: hands closed at a time.
+        threads: of the CPU, which ends the last directions.
         all_directions: as of :class:`Trial`.
     """
 
-    def __init__(self, model: Model, device: str, *, worlds: int = 4096, all_directions: bool = False) -> None:
+    def __init__(
+        self, model: Model, device: str, *, worlds: int = 4096, threads: int = 2, all_directions: bool = False
+    ) -> None:
         self._model, self._protocol = model, model.protocol
         placed = Placed.of(model, device)
         self._sim = Worlds(model, placed, worlds, device)
         self._pulled = [Worlds(model, placed, max(1, int(worlds * share)), device) for share in _SHARES]
         self._every = all_directions
-        self._spare = Trial(model, all_directions=all_directions)
+        self._spare = [Trial(model, all_directions=all_directions) for _ in range(threads)]
         self._bounds, self._one = Bounds(model.protocol), threading.Lock()
         at, turn = (a[0, model.base_body].astype(float) for a in self._sim.frames())
         T = np.block([[turn, at[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
@@ -109,7 +115,7 @@ class WorldTrials:
         own = [values for values in found if np.ndim(values)]
         verdicts = [Verdict(*values) for values in zip(*own, strict=True)]
         for i in np.flatnonzero(hands.full):
-            verdicts[i] = self._spare.run(rows, int(index[i]))
+            verdicts[i] = self._spare[0].run(rows, int(index[i]))
         return verdicts
 
     def _look(self, rows: GraspRows, index: np.ndarray) -> tuple[Look, np.ndarray]:
@@ -212,6 +218,12 @@ class WorldTrials:
                 for values, none in zip(pulls, Pulls.of(n, objects), strict=True):
                     values[late] = none[late]
                 return pulls, np.asarray((wild_pulls & ~late).any(1))
+            if not len(waiting) and len(busy) <= _FEW_PER_THREAD * len(self._spare):
+                so_far = [Closed(0, np.nan, False, worst[w], depth[w]) for w in busy]
+                i, k = job[busy].T
+                wild_pulls[i, k] = self._end_here(sim, busy, job[busy], total - done[busy], home[busy], so_far, pulls)
+                job[busy] = -1
+                continue
             while not len(waiting) and smaller and len(busy) <= smaller[-1].worlds:
                 rows = np.resize(busy, smaller[-1].worlds)
                 smaller[-1].take(sim.state, rows)
@@ -234,6 +246,38 @@ class WorldTrials:
             pulls.moved[i, k] = np.where(wild[ended, None, None], np.nan, worst[ended])
             wild_pulls[i, k] = wild[ended]
             job[ended] = -1
+
+    def _end_here(
+        self,
+        sim: Worlds,
+        worlds: np.ndarray,
+        jobs: np.ndarray,
+        left: np.ndarray,
+        home: np.ndarray,
+        so_far: list[Closed],
+        pulls: Pulls,
+    ) -> np.ndarray:
+        """End the directions of n worlds on the CPU, into ``pulls``; which diverged (n,).
+
+        Args:
+            jobs: grasp and direction (n, 2).
+            left: chunks (n,).
+            home: poses of the objects at the start (n, O, 7).
+        """
+        state = [values[worlds] for values in sim.states()]
+        wild, order, threads = np.zeros(len(worlds), bool), np.argsort(left), len(self._spare)
+
+        def end(number: int) -> None:
+            for w in order[number::threads]:
+                i, k = jobs[w]
+                load = np.tile(self._base_rotation @ AXES[k], (left[w] * sim.chunk, 1))
+                own = Pulls(*(values[i] for values in pulls))
+                begun = [values[w] for values in state]
+                wild[w] = self._spare[number].go_on(begun, home[w], load, own, k, so_far[w])
+
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(end, range(threads)))
+        return wild
 
     def _late(self, pulls: Pulls) -> np.ndarray:
         """Directions that one after the other would not be run, as all was decided before, (n, 6)."""

@@ -13,7 +13,6 @@ class MujocoWorld(World):
     """A MuJoCo model and its data.
 
     Args:
-        model: O objects in the order of the rows.
         near: hand and objects touch within 1 mm.
     """
 
@@ -70,6 +69,12 @@ class MujocoWorld(World):
 
     def restore(self, state: np.ndarray) -> None:
         self._lib.mj_setState(self._m, self.data, state, self._lib.mjtState.mjSTATE_INTEGRATION)
+
+    def take(self, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray, targets: np.ndarray) -> None:
+        """Go on from the state of another simulation of the model, its last accelerations included."""
+        self._lib.mj_resetData(self._m, self.data)
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        self.data.qacc_warmstart[:], self.data.ctrl[:] = warmstart, targets
 
     def objects(self) -> np.ndarray:
         return self.data.qpos[self._model.object_address]

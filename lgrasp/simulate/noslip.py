@@ -1,4 +1,4 @@
-"""Friction that does not creep, for MuJoCo Warp: one block of threads a world.
+"""Friction that does not creep, for MuJoCo Warp: one warp of a GPU a world.
 
 After the solver, whose friction is soft, the friction of each elliptic contact is found again as if it were hard, with
 all else as it is. For the friction f of a contact, which changes the accelerations a of J's rows by A = J M^-1 J^T,
@@ -9,12 +9,11 @@ one contact after the other, in some sweeps. This is MuJoCo's ``noslip``; that o
 which takes as long as all the rest of a step.
 """
 
-from functools import lru_cache
 from typing import Any
 
 import warp as wp
 
-from lgrasp.math.lanes import LANES
+from lgrasp.math.lanes import LANES, lanes_of, lanes_sum, meet
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.runtime.structs import make_struct
@@ -49,72 +48,63 @@ class _Rows:
     value: wp.array3d(dtype=wp.float32)  # (W, 1, ...)
     aim: wp.array2d(dtype=wp.float32)  # (W, R) accelerations that they ask for
     force: wp.array2d(dtype=wp.float32)  # (W, R)
-    start: wp.array2d(dtype=wp.int32)  # (C, ...) first row of each contact, along its normal
-    directions: wp.array(dtype=wp.int32)  # (C,) its rows
+    directions: wp.array(dtype=wp.int32)  # (C,) rows of each contact, the first along its normal
     friction: wp.array2d(dtype=wp.float32)  # (C, 5) coefficients
 
 
 @wp.struct
 class _Scratch:
-    """What the rows of contacts do, filled up with zeros to V' columns."""
+    """What the rows of contacts do; of the last four a lane reads what it has written."""
 
     factor: wp.array2d(dtype=wp.float32)  # (W, Z) of the inertia, L^T D L; D in the place of the ones
-    jacobian: wp.array3d(dtype=wp.float32)  # (W, R, V')
-    answer: wp.array3d(dtype=wp.float32)  # (W, R, V') accelerations that a unit force gives
+    inverse: wp.array3d(dtype=wp.float32)  # (W, V, V) of the inertia
+    jacobian: wp.array3d(dtype=wp.float32)  # (W, R, V)
+    answer: wp.array3d(dtype=wp.float32)  # (W, R, V) accelerations that a unit force gives
+    block: wp.array2d(dtype=wp.mat33)  # (W, R) A of the contact that begins with this row
 
 
 @wp.func
-def _solve(inertia: _Inertia, L: wp.array(dtype=wp.float32), x: wp.array(dtype=wp.float32)):
-    """Turn forces x (V) into accelerations, in place."""
+def _factor(inertia: _Inertia, w: wp.int32, lane: wp.int32, lanes: wp.int32, L: wp.array(dtype=wp.float32)):
+    """Factor the inertia of a world."""
+    for k in range(lane, L.shape[0], lanes):
+        L[k] = inertia.value[w, k]
+    meet()
+    rows = inertia.first.shape[0]
+    for back in range(rows):
+        first = inertia.first[rows - 1 - back]
+        last = first + inertia.length[rows - 1 - back] - 1
+        for ahead in range(last - first):
+            k = last - 1 - ahead
+            share = L[k] / L[last]
+            above = inertia.first[inertia.column[k]]
+            for j in range(lane, k - first + 1, lanes):
+                L[above + j] = L[above + j] - share * L[first + j]
+            meet()
+            if lane == 0:
+                L[k] = share
+
+
+@wp.func
+def _solve_unit(
+    inertia: _Inertia, L: wp.array(dtype=wp.float32), unit: wp.int32, inverse: wp.array2d(dtype=wp.float32)
+):
+    """Column ``unit`` of the inverse (V, V): the accelerations of a force of 1."""
     n = inertia.first.shape[0]
+    for i in range(n):
+        inverse[i, unit] = wp.where(i == unit, 1.0, 0.0)
     for back in range(n):
         i = n - 1 - back
         last = inertia.first[i] + inertia.length[i] - 1
-        if x[i] != 0.0:
+        x = inverse[i, unit]
+        if x != 0.0:
             for k in range(inertia.first[i], last):
-                x[inertia.column[k]] = x[inertia.column[k]] - L[k] * x[i]
-            x[i] = x[i] / L[last]
+                inverse[inertia.column[k], unit] = inverse[inertia.column[k], unit] - L[k] * x
+            inverse[i, unit] = x / L[last]
     for i in range(n):
+        x = inverse[i, unit]
         for k in range(inertia.first[i], inertia.first[i] + inertia.length[i] - 1):
-            x[i] = x[i] - L[k] * x[inertia.column[k]]
-
-
-@wp.kernel
-def _factor(
-    inertia: _Inertia,
-    count: wp.array(dtype=wp.int32),
-    smooth: wp.array2d(dtype=wp.float32),
-    constraint: wp.array2d(dtype=wp.float32),
-    scratch_out: _Scratch,
-    acceleration_out: wp.array2d(dtype=wp.float32),
-):
-    """Factor the inertia of each world that has constraints; accelerations become those of the solver's forces.
-
-    Args:
-        count: (W,) constraints.
-        smooth: (W, V) forces without constraints [N or N m].
-        constraint: (W, V) those of constraints.
-        acceleration_out: (W, V).
-    """
-    w = wp.tid()
-    if count[w] > 0:
-        L = scratch_out.factor[w]
-        for k in range(L.shape[0]):
-            L[k] = inertia.value[w, k]
-        rows = inertia.first.shape[0]
-        for back in range(rows):
-            first = inertia.first[rows - 1 - back]
-            last = first + inertia.length[rows - 1 - back] - 1
-            for ahead in range(last - first):
-                k = last - 1 - ahead
-                share = L[k] / L[last]
-                above = inertia.first[inertia.column[k]]
-                for j in range(k - first + 1):
-                    L[above + j] = L[above + j] - share * L[first + j]
-                L[k] = share
-        for i in range(rows):
-            acceleration_out[w, i] = smooth[w, i] + constraint[w, i]
-        _solve(inertia, L, acceleration_out[w])
+            x -= L[k] * inverse[inertia.column[k], unit]
+        inverse[i, unit] = x
 
 
 @wp.func
@@ -139,84 +129,117 @@ def _cheapest(A: wp.mat33, b: wp.vec3, mu: wp.vec3, normal: wp.float32):
     return D * x
 
 
-@lru_cache
-def noslip_kernels(width: int) -> tuple[Any, Any]:
-    """Two kernels for rows of ``width`` columns: what the rows do, and the sweeps."""
+@wp.func
+def _lay_out(rows: _Rows, w: wp.int32, r: wp.int32, used: wp.int32, lane: wp.int32, lanes: wp.int32, out: _Scratch):
+    """Write what the ``used`` rows of friction of the contact that begins with row r do, and its A."""
+    A = wp.mat33()
+    for i in range(lane, out.inverse.shape[1], lanes):
+        j, y = wp.vec3(), wp.vec3()
+        for d in range(used):
+            row = r + 1 + d
+            for k in range(rows.first[w, row], rows.first[w, row] + rows.length[w, row]):
+                column, value = rows.column[w, 0, k], rows.value[w, 0, k]
+                y[d] += out.inverse[w, column, i] * value
+                if column == i:
+                    j[d] = value
+            out.jacobian[w, row, i] = j[d]
+            out.answer[w, row, i] = y[d]
+        A += wp.outer(j, y)
+    for d in range(3):
+        for e in range(d + 1):
+            A[d, e] = lanes_sum(A[d, e])
+            A[e, d] = A[d, e]
+        A[d, d] = wp.where(d < used, wp.max(A[d, d], _LEAST), 1.0)
+    out.block[w, r] = A
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def fill(rows: _Rows, inertia: _Inertia, scratch_out: _Scratch):
-        """Write the rows of friction and what they do; (W, R)."""
-        w, r = wp.tid()
-        if r >= rows.count[w] or rows.kinds[w, r] != rows.elliptic:
-            return
-        if rows.start[rows.contact[w, r], 0] == r:
-            return
-        x = wp.zeros(shape=(width,), dtype=wp.float32)
-        for k in range(rows.first[w, r], rows.first[w, r] + rows.length[w, r]):
-            x[rows.column[w, 0, k]] = rows.value[w, 0, k]
-        for i in range(width):
-            scratch_out.jacobian[w, r, i] = x[i]
-        _solve(inertia, scratch_out.factor[w], x)
-        for i in range(width):
-            scratch_out.answer[w, r, i] = x[i]
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def sweep(rows: _Rows, scratch: _Scratch, iterations: wp.int32, acceleration_out: wp.array2d(dtype=wp.float32)):
-        """Find the friction of every contact of a world afresh; one block of threads a world.
+@wp.func
+def _friction(rows: _Rows, w: wp.int32, r: wp.int32, used: wp.int32):
+    """Friction (3,) of the contact that begins with row r."""
+    f = wp.vec3()
+    for d in range(used):
+        f[d] = rows.force[w, r + 1 + d]
+    return f
 
-        Args:
-            acceleration_out: (W, V), changed accordingly.
-        """
-        w = wp.tid()
-        end = wp.min(rows.count[w], rows.kinds.shape[1])
-        a = wp.tile_load(acceleration_out[w], shape=width)
-        for _it in range(iterations):
-            r = int(0)
-            while r < end:
-                ahead = int(1)
-                if rows.kinds[w, r] == rows.elliptic:
-                    c = rows.contact[w, r]
-                    ahead = rows.directions[c]
-                    normal = rows.force[w, r]
-                    if ahead >= 3 and r + ahead <= end and normal > 0.0:
-                        last = wp.where(ahead > 3, r + 3, r + 2)
-                        used = wp.where(ahead > 3, 1.0, 0.0)
-                        j0 = wp.tile_load(scratch.jacobian[w, r + 1], shape=width)
-                        j1 = wp.tile_load(scratch.jacobian[w, r + 2], shape=width)
-                        j2 = wp.tile_load(scratch.jacobian[w, last], shape=width) * used
-                        y0 = wp.tile_load(scratch.answer[w, r + 1], shape=width)
-                        y1 = wp.tile_load(scratch.answer[w, r + 2], shape=width)
-                        y2 = wp.tile_load(scratch.answer[w, last], shape=width) * used
-                        A = wp.mat33()
-                        A[0, 0] = wp.max(wp.tile_sum(wp.tile_map(wp.mul, j0, y0))[0], _LEAST)
-                        A[1, 1] = wp.max(wp.tile_sum(wp.tile_map(wp.mul, j1, y1))[0], _LEAST)
-                        A[2, 2] = wp.max(wp.tile_sum(wp.tile_map(wp.mul, j2, y2))[0], _LEAST) + (1.0 - used)
-                        A[0, 1] = wp.tile_sum(wp.tile_map(wp.mul, j0, y1))[0]
-                        A[0, 2] = wp.tile_sum(wp.tile_map(wp.mul, j0, y2))[0]
-                        A[1, 2] = wp.tile_sum(wp.tile_map(wp.mul, j1, y2))[0]
-                        A[1, 0] = A[0, 1]
-                        A[2, 0] = A[0, 2]
-                        A[2, 1] = A[1, 2]
-                        rest = wp.vec3(
-                            wp.tile_sum(wp.tile_map(wp.mul, j0, a))[0] - rows.aim[w, r + 1],
-                            wp.tile_sum(wp.tile_map(wp.mul, j1, a))[0] - rows.aim[w, r + 2],
-                            wp.tile_sum(wp.tile_map(wp.mul, j2, a))[0] - rows.aim[w, last] * used,
-                        )
-                        before = wp.vec3(rows.force[w, r + 1], rows.force[w, r + 2], rows.force[w, last] * used)
-                        twist = wp.where(ahead > 3, rows.friction[c, 2], 1.0)
-                        mu = wp.vec3(rows.friction[c, 0], rows.friction[c, 1], twist)
-                        f = _cheapest(A, rest - A * before, mu, normal)
-                        more = f - before
-                        if wp.dot(more, 0.5 * (A * more) + rest) <= _LEAST:
-                            rows.force[w, r + 1] = f[0]
-                            rows.force[w, r + 2] = f[1]
-                            if ahead > 3:
-                                rows.force[w, last] = f[2]
-                            a += y0 * more[0] + y1 * more[1] + y2 * more[2]
-                r += ahead
-        wp.tile_store(acceleration_out[w], a)
 
-    return fill, sweep
+@wp.func
+def _harden(
+    rows_out: _Rows,
+    scratch: _Scratch,
+    w: wp.int32,
+    r: wp.int32,
+    used: wp.int32,
+    lane: wp.int32,
+    lanes: wp.int32,
+    acceleration_out: wp.array(dtype=wp.float32),
+):
+    """Find the friction of the contact that begins with row r afresh."""
+    c, normal = rows_out.contact[w, r], rows_out.force[w, r]
+    rest = wp.vec3()
+    for i in range(lane, acceleration_out.shape[0], lanes):
+        for d in range(used):
+            rest[d] += scratch.jacobian[w, r + 1 + d, i] * acceleration_out[i]
+    for d in range(3):
+        rest[d] = lanes_sum(rest[d])
+        if d < used:
+            rest[d] -= rows_out.aim[w, r + 1 + d]
+    before = _friction(rows_out, w, r, used)
+    mu = wp.vec3(rows_out.friction[c, 0], rows_out.friction[c, 1], wp.where(used > 2, rows_out.friction[c, 2], 1.0))
+    A = scratch.block[w, r]
+    more = _cheapest(A, rest - A * before, mu, normal) - before
+    if wp.dot(more, 0.5 * (A * more) + rest) <= _LEAST:
+        meet()
+        for d in range(used):
+            if lane == 0:
+                rows_out.force[w, r + 1 + d] = before[d] + more[d]
+            for i in range(lane, acceleration_out.shape[0], lanes):
+                acceleration_out[i] = acceleration_out[i] + scratch.answer[w, r + 1 + d, i] * more[d]
+        meet()
+
+
+@wp.kernel
+def noslip(
+    inertia: _Inertia,
+    smooth: wp.array2d(dtype=wp.float32),
+    constraint: wp.array2d(dtype=wp.float32),
+    iterations: wp.int32,
+    lanes: wp.int32,
+    rows_out: _Rows,
+    scratch_out: _Scratch,
+    acceleration_out: wp.array2d(dtype=wp.float32),
+):
+    """Find the friction of every contact of each world afresh; (W, lanes).
+
+    Args:
+        smooth: (W, V) forces without constraints [N or N m].
+        constraint: (W, V) those of constraints.
+        acceleration_out: (W, V), where there are constraints.
+    """
+    w, lane = wp.tid()
+    end = wp.min(rows_out.count[w], rows_out.kinds.shape[1])
+    if end == 0:
+        return
+    _factor(inertia, w, lane, lanes, scratch_out.factor[w])
+    meet()
+    V = acceleration_out.shape[1]
+    for i in range(lane, V, lanes):
+        _solve_unit(inertia, scratch_out.factor[w], i, scratch_out.inverse[w])
+        a = float(0.0)
+        for k in range(V):
+            a += scratch_out.inverse[w, k, i] * (smooth[w, k] + constraint[w, k])
+        acceleration_out[w, i] = a
+    for it in range(iterations):
+        r = int(0)
+        while r < end:
+            ahead = int(1)
+            if rows_out.kinds[w, r] == rows_out.elliptic:
+                ahead = rows_out.directions[rows_out.contact[w, r]]
+                used = wp.min(ahead - 1, 3)
+                if used >= 2 and r + ahead <= end and rows_out.force[w, r] > 0.0:
+                    if it == 0:
+                        _lay_out(rows_out, w, r, used, lane, lanes, scratch_out)
+                    _harden(rows_out, scratch_out, w, r, used, lane, lanes, acceleration_out[w])
+            r += ahead
 
 
 class NoSlip:
@@ -228,11 +251,9 @@ class NoSlip:
     """
 
     def __init__(self, m: Any, d: Any, iterations: int) -> None:
-        self._d, self._iterations = d, iterations
-        worlds, room = d.nworld, d.njmax
-        width = -(-m.nv // LANES) * LANES  # rows are filled up
+        self._d, self._iterations, self._lanes = d, iterations, lanes_of(d.M.device)
         self._inertia = make_struct(_Inertia, length=m.M_rownnz, first=m.M_rowadr, column=m.M_colind, value=d.M)
-        e, c = d.efc, d.contact
+        e, c, worlds, room = d.efc, d.contact, d.nworld, d.njmax
         friction = wp.array(ptr=c.friction.ptr, dtype=wp.float32, shape=(len(c.friction), 5), copy=False)
         self._rows = make_struct(
             _Rows,
@@ -246,23 +267,25 @@ class NoSlip:
             value=e.J,
             aim=e.aref,
             force=e.force,
-            start=c.efc_address,
             directions=c.dim,
             friction=friction,
         )
         self._scratch = make_struct(
             _Scratch,
             factor=wp.empty(d.M.shape, dtype=wp.float32),
-            jacobian=wp.empty((worlds, room, width), dtype=wp.float32),
-            answer=wp.empty((worlds, room, width), dtype=wp.float32),
+            inverse=wp.empty((worlds, m.nv, m.nv), dtype=wp.float32),
+            jacobian=wp.empty((worlds, room, m.nv), dtype=wp.float32),
+            answer=wp.empty((worlds, room, m.nv), dtype=wp.float32),
+            block=wp.empty((worlds, room), dtype=wp.mat33),
         )
-        self._fill, self._sweep = noslip_kernels(width)
 
     def run(self) -> None:
         """Change the friction that the solver found, and with it the accelerations ``qacc``."""
-        d, scratch = self._d, self._scratch
-        forces = [d.nefc, d.qfrc_smooth, d.qfrc_constraint]
-        wp.launch(_factor, d.nworld, [self._inertia, *forces], [scratch, d.qacc])
-        wp.launch(self._fill, (d.nworld, d.njmax), [self._rows, self._inertia], [scratch])
-        inputs = [self._rows, scratch, self._iterations]
-        wp.launch_tiled(self._sweep, dim=[d.nworld], inputs=inputs, outputs=[d.qacc], block_dim=LANES)
+        d = self._d
+        wp.launch(
+            noslip,
+            (d.nworld, self._lanes),
+            [self._inertia, d.qfrc_smooth, d.qfrc_constraint, self._iterations, self._lanes],
+            [self._rows, self._scratch, d.qacc],
+            block_dim=2 * LANES,
+        )

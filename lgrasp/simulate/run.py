@@ -109,9 +109,7 @@ def verdicts(
     has and no others of the scene.
 
     Args:
-        scene: hand and objects of the rows.
         rows: N grasps of O objects at most; K columns of q and contacts as in a shard.
-        protocol: what is simulated.
         threads: grasps simulated at a time; in processes where Python works between steps (PhysX, Drake).
         progress: called on this thread with (rows done, rows held); what it raises ends the simulation.
         all_directions: continue after the first direction in which an object is lost.
@@ -139,11 +137,14 @@ def verdicts(
         begin = time.perf_counter()
         model = build_model(scene, protocol, rows.q[0], group.objects)
         _check_held(model, group.rows)
-        worlds = None if on_cpu(device, protocol) else _worlds(model, device, len(group.rows), all_directions, keep)
+        worlds = (
+            None if on_cpu(device, protocol) else _worlds(model, device, len(group.rows), threads, all_directions, keep)
+        )
         if prepared:
             prepared(time.perf_counter() - begin)
         if worlds:
-            some = worlds.run(group.rows, advanced)
+            with _silence():
+                some = worlds.run(group.rows, advanced)
         elif protocol.engine != "mujoco" and threads > 1 and len(group.rows) > _FEW:
             some = _in_processes(model, group.rows, threads, advanced, all_directions, keep)
         else:
@@ -174,7 +175,9 @@ def _check_device(device: str, protocol: Protocol) -> None:
         raise PhysicsError(f"protocol {protocol.name} {why}")
 
 
-def _worlds(model: Model, device: str, rows: int, all_directions: bool, keep: Keep | None) -> "WorldTrials":
+def _worlds(
+    model: Model, device: str, rows: int, threads: int, all_directions: bool, keep: Keep | None
+) -> "WorldTrials":
     """Worlds for the rows, or those made before; their kernels are compiled."""
     import warp as wp
 
@@ -182,7 +185,7 @@ def _worlds(model: Model, device: str, rows: int, all_directions: bool, keep: Ke
 
     def make() -> WorldTrials:
         worlds = hands_at_once(rows, len(model.object_body), wp.get_device(device).free_memory)
-        return WorldTrials(model, device, worlds=worlds, all_directions=all_directions)
+        return WorldTrials(model, device, worlds=worlds, threads=threads, all_directions=all_directions)
 
     return keep("simulate", (model, device, all_directions), make) if keep else make()
 

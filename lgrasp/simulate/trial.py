@@ -1,5 +1,6 @@
 """One grasp in a simulator: close the hand once, then pull the objects in each direction from that same state."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -31,7 +32,6 @@ class Trial:
     """A simulation that serves one grasp after another; every thread has its own.
 
     Args:
-        model: O objects in the order of the rows.
         all_directions: continue after a direction in which the grasp is lost.
     """
 
@@ -132,16 +132,35 @@ class Trial:
         for k, load in course.items():
             if not shaken:
                 self._world.restore(squeezed)
-            pulls.moved[k], pulls.depth[k] = self._pull(load @ base.T, closed)
-            if self._world.wild():
-                diverged, pulls.held[k], pulls.moved[k] = True, 0, np.nan
-            else:
-                pulls.touches[k] = self._world.links_touching() > 0
-                pulls.held[k] = self._bounds.held(pulls.moved[k], pulls.touches[k], pulls.depth[k])
+            diverged |= self._pull_into(pulls, k, load @ base.T, closed)
             holds, stays = holds and pulls.held[k] == 1, stays and self._bounds.stays(pulls.moved[k])
             if not (self._all or holds or stays):
                 break
         return diverged
+
+    def go_on(
+        self, state: Sequence[np.ndarray], home: np.ndarray, load: np.ndarray, pulls: Pulls, k: int, so_far: Closed
+    ) -> bool:
+        """End direction k that another simulation began, into ``pulls``; True if it diverged.
+
+        Args:
+            state: of :meth:`MujocoWorld.take`.
+            home: poses of the objects at the start, (O, 7).
+            load: what is left of it, (T, 3).
+        """
+        self._still.take(*state)
+        self._start = home
+        return self._pull_into(pulls, k, load, so_far)
+
+    def _pull_into(self, pulls: Pulls, k: int, load: np.ndarray, so_far: Closed) -> bool:
+        """Run direction k into ``pulls``; True if it diverged."""
+        pulls.moved[k], pulls.depth[k] = self._pull(load, so_far)
+        if self._world.wild():
+            pulls.held[k], pulls.moved[k] = 0, np.nan
+            return True
+        pulls.touches[k] = self._world.links_touching() > 0
+        pulls.held[k] = self._bounds.held(pulls.moved[k], pulls.touches[k], pulls.depth[k])
+        return False
 
     def _pull(self, load: np.ndarray, closed: Closed) -> tuple[np.ndarray, float]:
         """Load the objects in each of T steps, over their forces, (T, 3) [world frame]; ends early where they have come

@@ -285,6 +285,10 @@ class Worlds:
         for a, now in zip(kept, self.state, strict=True):
             wp.launch(_take, now.shape, [self._rows, a], [now], device=self._device)
 
+    def states(self) -> list[np.ndarray]:
+        """Positions (W, nq), velocities (W, nv), the solver's last accelerations (W, nv) and targets (W, nu)."""
+        return fetch([*self.state[:3], self._targets.end])
+
     def hold(self, rows: np.ndarray, forces: np.ndarray) -> None:
         """In worlds whose row (W,) is not -1 the targets stay at their ends, and forces (W, O, 3) [N] pull from now on
         at the centres of mass of the objects."""

@@ -9,9 +9,13 @@ from support.jaws import EDGE, Jaws
 from support.judging import judge
 
 from lgrasp.errors import ConfigError, PhysicsError
+from lgrasp.simulate.model import build_model
+from lgrasp.simulate.mujoco_world import MujocoWorld
 from lgrasp.simulate.protocol import PROTOCOLS, find_protocol
 from lgrasp.simulate.run import protocol_text
 from lgrasp.simulate.scene import scene_of
+from lgrasp.simulate.trial import Trial
+from lgrasp.simulate.verdict import Closed, Pulls, moved
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 
@@ -133,6 +137,25 @@ def test_weight_of_an_object(jaws: Jaws):
     assert protocol.load(100 * EDGE**3).stiffness == 100.0
     for normal, holds in ((0.2, False), (0.35, True)):  # 2 x 0.6 x N against 0.31 N
         assert judge(jaws.shard(press(normal)), protocol)["holds"] == [holds]
+
+
+def test_a_direction_can_be_ended_by_another(jaws: Jaws):
+    """The object goes as far as where it all runs in one simulation."""
+    shard = jaws.shard(0.002)
+    model = build_model(scene_of(shard.hand, shard.objects), PROTOCOLS["fc"], shard.grasps.q[0])
+    pose, here = shard.grasps.object_pose[0], MujocoWorld(model)
+    here.begin(shard.grasps.q[0], pose)
+    home, load = here.objects().copy(), np.tile([0.0, 0.0, 1.0], (12, 1))
+    here.drive(model.controls(shard.grasps.q_squeeze[0].astype(float)))
+    here.push(model.forces[:, None] * load[0])
+    here.step(20)
+    begun = [a.copy() for a in (here.data.qpos, here.data.qvel, here.data.qacc_warmstart, here.data.ctrl)]
+    here.step(len(load))
+    pulls, so_far = Pulls.of(1), Closed(0, np.nan, False, np.zeros((1, 2)), 0.0)
+    diverged = Trial(model).go_on(begun, home, load, pulls, 4, so_far)
+    assert not diverged
+    assert pulls.held.tolist() == [-1] * 4 + [1, -1]
+    np.testing.assert_allclose(pulls.moved[4], moved(here.objects(), home), atol=1e-9)
 
 
 def test_divergence_is_a_failure_and_writes_nothing(jaws: Jaws, fc, tmp_path, monkeypatch):
