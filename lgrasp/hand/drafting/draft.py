@@ -211,8 +211,9 @@ def _kept_apart(model: HandModel | None) -> set[tuple[str, str]]:
 
 def _check_size(urdf: Urdf, survey: ContactSurvey) -> None:
     t = survey.postures.t.reshape(-1, 3)
-    reach = survey.model.body_sphere[survey.model.body_sphere[:, 3] > 0, 3].max()
-    extent = float(max(np.ptp(t, axis=0).max(), reach))
+    radius = survey.model.body_sphere[survey.model.body_sphere[:, 3] > 0, 3].max()
+    sizes = {"joint origins": float(np.ptp(t, axis=0).max()), "lengths of its geometry": 2.0 * float(radius)}
+    extent = max(sizes.values())
     if extent < _LEAST_EXTENT:
         raise HandError(
             f"URDF {urdf.path}: the hand is {1000 * extent:.2g} mm large; lengths are in metres; is a scale applied "
@@ -220,7 +221,8 @@ def _check_size(urdf: Urdf, survey: ContactSurvey) -> None:
         )
     if extent > _MOST_EXTENT:
         raise HandError(
-            f"URDF {urdf.path}: the hand is {extent:.3g} m large; joint origins are probably in millimetres, "
+            f"URDF {urdf.path}: the hand is {extent:.3g} m large; "
+            f"{' and '.join(what for what, size in sizes.items() if size > _MOST_EXTENT)} are probably in millimetres, "
             "multiply them by 0.001"
         )
 

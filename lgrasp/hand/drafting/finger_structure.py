@@ -89,8 +89,10 @@ def finger_structure(urdf: Urdf, name: str, mover: str | None = None) -> FingerS
     while mover is None and (joint := _shared_joint(structure)) is not None:
         locked.append(joint)
         structure = _structure(urdf, name, {n: held_value(by_name[n]) for n in locked})
+    carry = {body for tip in structure.tips for body in structure.tree.path(tip)}
     for j in urdf.joints:
-        if j.name in structure.tree.joint_names and not j.prismatic and j.upper - j.lower > 13.0:
+        turns = j.name in structure.tree.joint_names and not j.prismatic and j.upper - j.lower > 13.0
+        if turns and structure.tree.body_of(j.child) in carry:  # a motor or screw may
             raise HandError(
                 f"URDF {urdf.path}: joint '{j.name}' turns from {j.lower:g} to {j.upper:g} rad; its limits are "
                 "probably in degrees, multiply them by 0.0174533"

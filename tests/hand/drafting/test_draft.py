@@ -171,6 +171,25 @@ def test_limits_in_degrees_are_refused(tmp_path):
         draft_spec(fingers(tmp_path, 2, upper=90.0))
 
 
+@pytest.mark.usefixtures("no_spaces")
+def test_a_lead_screw_turns_as_often_as_it_needs(tmp_path):
+    path, screw = gripper(tmp_path), '<link name="screw"/><joint name="s" type="revolute"><parent link="base"/>'
+    screw += '<child link="screw"/><limit lower="0" upper="40"/></joint></robot>'
+    text = path.read_text().replace("</joint>", '<mimic joint="s" multiplier="0.001"/></joint>')
+    path.write_text(text.replace("</robot>", screw))
+    tree = build_tree(
+        read_urdf(path), import_urdf(path, out=tmp_path / "made").spec.model_copy(update={"base_link": None})
+    )
+    assert (tree.joint_names, tree.joint_upper.tolist()) == (("s",), [40.0])
+
+
+def test_what_is_in_millimetres_is_named(tmp_path):
+    path = fingers(tmp_path, 2)
+    path.write_text(path.read_text().replace("0.04 0.1 0.03", "40 100 30"))
+    with pytest.raises(HandError, match="large; lengths of its geometry are probably in millimetres"):
+        draft_spec(path)
+
+
 def test_mesh_in_millimetres_is_refused_by_its_own_name(tmp_path):
     trimesh.creation.capsule(height=20.0, radius=8.0).export(tmp_path / "tip.stl")
     path = fingers(tmp_path, 2, '<geometry><mesh filename="tip.stl"/></geometry>')
