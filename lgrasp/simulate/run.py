@@ -86,6 +86,7 @@ Keep = Callable[[str, Hashable, Callable[[], Any]], Any]
 
 _HELD_TOLERANCE = 1.0e-4  # [rad or m]
 _FEW = 8  # rows for which no process is started
+_LOOK = 0.5  # [s] between calls that tell how far it is
 
 
 def verdicts(
@@ -201,8 +202,12 @@ def _on_threads(
             own.trial = Trial(model, all_directions=all_directions)
         return own.trial.run(rows, i)
 
-    with _silence(), ThreadPoolExecutor(threads) as pool:
-        return _collected([pool.submit(judge, i) for i in range(len(rows))], progress)
+    pool = ThreadPoolExecutor(threads)
+    try:
+        with _silence():
+            return _collected([pool.submit(judge, i) for i in range(len(rows))], progress)
+    finally:  # a row of another simulator may take a minute
+        pool.shutdown(wait=model.protocol.engine == "mujoco", cancel_futures=True)
 
 
 def _in_processes(
@@ -239,12 +244,18 @@ def _unpacked(packed: bytes) -> tuple[Trial, GraspRows]:
 
 
 def _collected(found: Sequence[Future[Verdict]], progress: Callable[[int, int], None]) -> list[Verdict]:
-    """All verdicts in order; what ``progress`` raises cancels those that have not begun."""
-    held = 0
+    """All verdicts in order; what ``progress`` raises, which is called while rows take long as well, cancels those that
+    have not begun."""
+    left, held = set(found), 0
     try:
-        for done, verdict in enumerate(as_completed(found), 1):
-            held += verdict.result().holds
-            progress(done, held)
+        while left:
+            try:
+                for verdict in as_completed(list(left), _LOOK):
+                    left.remove(verdict)
+                    held += verdict.result().holds
+                    progress(len(found) - len(left), held)
+            except TimeoutError:
+                progress(len(found) - len(left), held)
     except BaseException:
         for verdict in found:
             verdict.cancel()

@@ -184,10 +184,12 @@ def moved(pose: np.ndarray, home: np.ndarray) -> np.ndarray:
     """How far objects are from where they started: displacement [m] and rotation [rad], (..., O, 2), by poses of their
     centres of mass now and at the start (..., O, 7)."""
     now, start = np.asarray(pose, float), np.asarray(home, float)
-    norm = np.linalg.norm(now[..., 3:], axis=-1) * np.linalg.norm(start[..., 3:], axis=-1)
-    cosine = np.abs((now[..., 3:] * start[..., 3:]).sum(-1)) / np.maximum(norm, 1e-12)
-    shift = np.linalg.norm(now[..., :3] - start[..., :3], axis=-1)
-    return np.stack([shift, 2 * np.arccos(np.minimum(cosine, 1.0))], axis=-1)
+    a, b, shift = now[..., 3:], start[..., 3:], now[..., :3] - start[..., :3]
+    cosine = np.abs(np.vecdot(a, b)) / np.maximum(np.sqrt(np.vecdot(a, a) * np.vecdot(b, b)), 1e-12)
+    found = np.empty((*shift.shape[:-1], 2))
+    found[..., 0] = np.sqrt(np.vecdot(shift, shift))
+    found[..., 1] = 2 * np.arccos(np.minimum(cosine, 1.0))
+    return found
 
 
 def at_rest(velocity: np.ndarray) -> np.ndarray:
