@@ -132,6 +132,16 @@ class ProcessPool(ProcessPoolExecutor):
         for _ in range(self._workers):
             self.submit(import_module, module)
 
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """As every executor's; with ``cancel_futures`` calls that have begun are cut off."""
+        manager: Any = self._executor_manager_thread
+        processes = list((self._processes or {}).values())
+        super().shutdown(wait=False, cancel_futures=cancel_futures)
+        for process in processes if cancel_futures else ():
+            process.kill()
+        if wait and manager:
+            manager.join(_PATIENCE if cancel_futures else None)
+
     def __exit__(
         self, exc_type: type[BaseException] | None, exc_val: BaseException | None, exc_tb: TracebackType | None
     ) -> None:

@@ -4,10 +4,16 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
+from support.jaws import Jaws
+from support.simulators import need
 
+from lgrasp.dataset.writer import write_shard
 from lgrasp_cli import stopping
+from lgrasp_cli.progress import JobProgress
 from lgrasp_cli.stopping import on_interrupt
 
 WORK = {
@@ -57,3 +63,20 @@ def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch):
         monkeypatch.setattr(stopping, "_ONE", 0.0)
         signal.raise_signal(signal.SIGINT)
         assert heard == [False, True]
+
+
+def test_a_row_that_takes_long_does_not_keep_a_job_from_stopping(cli, tmp_path, monkeypatch):
+    need("physx")
+    from lgrasp.simulate.trial import Trial  # needs MuJoCo
+
+    write_shard(tmp_path / "one.h5", Jaws(tmp_path).shard(0.004))
+    begun, end = threading.Event(), threading.Event()
+    monkeypatch.setattr(Trial, "run", lambda *_: (begun.set(), end.wait(60)))
+    monkeypatch.setattr(JobProgress, "cancelled", lambda _: begun.is_set())
+    started = time.monotonic()
+    result = cli("simulate", "one.h5", "--engine", "physx", "--workers", 1)
+    took = time.monotonic() - started
+    end.set()
+    assert result.code == 130
+    assert result.err == "interrupted: nothing is finished; the same command begins again\n"
+    assert took < 30

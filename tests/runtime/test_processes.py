@@ -3,6 +3,7 @@
 import multiprocessing
 import subprocess
 import sys
+import time
 
 import pytest
 from support.workers import leave
@@ -36,4 +37,15 @@ def test_a_pool_that_is_kept_ends_when_all_is_forgotten():
     kept.close()
     with pytest.raises(RuntimeError, match="shutdown"):
         pool.submit(abs, -2)
+    assert multiprocessing.active_children() == []
+
+
+def test_what_a_pool_is_doing_is_cut_off():
+    begun = time.monotonic()
+    pool = ProcessPool(1)
+    assert pool.submit(abs, -2).result() == 2
+    for _ in range(2):
+        pool.submit(time.sleep, 60)
+    pool.shutdown(cancel_futures=True)
+    assert time.monotonic() - begun < 30
     assert multiprocessing.active_children() == []
