@@ -86,13 +86,16 @@ def test_a_task_reports_what_is_there(tasks):
     ]
 
 
-def test_pairs_with_few_grasps_are_named(cache_root, tmp_path, said):
+def test_pairs_with_few_grasps_are_named(cache_root, tmp_path):
     """The ball is too large for the hand."""
     trimesh.creation.icosphere(3, 0.2).export(tmp_path / "moon.obj")
     pool = {"hands": ("barrett",), "objects": (str(tmp_path / "moon.obj"),), "rows": ROWS}
     job = CompareJob(**pool, pipeline=QUICK, out=tmp_path / "out", device="cpu", workers=1, cache=Cache(cache_root))
-    data = job_report(run(job))
-    assert any("fewer than 4 grasps: barrett with moon 0;" in line for line in said)
+    data = job_report(outcome := run(job))
+    error = job.shortfall(outcome)
+    assert error is not None
+    assert error.exit_code == 3
+    assert "fewer than 4 grasps: barrett with moon 0;" in str(error)
     assert data["short"] == [{"hand": "barrett", "object": "moon", "rows": 0}]
     assert data["hands"][0]["all"]["hold"] is None
     assert "leave out objects without a grasp" in (tmp_path / "out/compare.html").read_text()

@@ -1,6 +1,6 @@
 """Hands compared on objects: a shard of each hand with each object, their numbers, and a page."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
@@ -9,14 +9,14 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from lgrasp.choices import ProtocolName
-from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.reader import count_rows, read_shard
 from lgrasp.engine.cache import Cache, content_key
 from lgrasp.engine.events import CancelledError, Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.inputs import Loader
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.run import Job, run
-from lgrasp.errors import HandError
+from lgrasp.errors import HandError, LgraspError, StarvedError
 from lgrasp.files import temporary_folder
 from lgrasp.grasp.records import Shard
 from lgrasp.grasp.schema import MADE_FROM
@@ -34,7 +34,6 @@ from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.metrics import HOLD, MetricsJob
 from lgrasp.jobs.requests.compare import CompareRequest, Variation, parse_variations
 from lgrasp.jobs.simulate import SimulateJob
-from lgrasp.notices import notice
 from lgrasp.object.find import all_objects
 from lgrasp.simulate.protocol import find_protocol
 
@@ -153,21 +152,26 @@ class CompareJob(CompareRequest, Job):
                     "all": measure_hand(objects, files[hand.name]),
                 }
             )
-        short = [
-            {"hand": h["hand"], "object": name, "rows": cell["rows"]}
-            for h in hands
-            for name, cell in h["objects"].items()
-            if cell["rows"] < self.rows
-        ]
-        if short:
-            pairs = ", ".join(f"{s['hand']} with {s['object']} {s['rows']:,}" for s in short)
-            notice(f"fewer than {self.rows:,} grasps: {pairs}; {WITHOUT_ROWS}")
-        told = {"hands": hands, "missing": missing, "asked_rows": self.rows, "short": short, "page": None}
+        told = {"hands": hands, "missing": missing, "asked_rows": self.rows, "page": None}
+        told["short"] = self._short([path for paths in files.values() for path in paths])
         data = told | {"pipeline": self.pairs[0][1].pipeline.name, "simulate": self.simulate}
         if hands:
             data["page"] = str(self.out / PAGE)
             write_page(data | {"device": outcome.device.name}, files, self.out / PAGE)
         return data
+
+    def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
+        short = self._short(outcome.paths)
+        pairs = ", ".join(f"{s['hand']} with {s['object']} {s['rows']:,}" for s in short)
+        return StarvedError(f"fewer than {self.rows:,} grasps: {pairs}; {WITHOUT_ROWS}") if short else None
+
+    def _short(self, files: Collection[Path]) -> list[dict[str, Any]]:
+        """``hand``, ``object`` and ``rows`` of those files that have fewer than asked."""
+        return [
+            {"hand": hand.name, "object": job.object_name, "rows": rows}
+            for part, (hand, job) in zip(self.parts(), self.pairs, strict=True)
+            if part.file in files and (rows := count_rows(part.file)) < self.rows
+        ]
 
     def _workspace(self, job: GenerateJob) -> Workspace:
         key = content_key("workspace", WORKSPACE_VERSION, hand=job.keys.hand)
