@@ -102,7 +102,7 @@ def test_two_objects(name: str):
     assert here[f"{name}_holds"].tolist() == [True, False, False, True]
     for column in ("holds", "directions", "stays", "object_touches", "settled", "diverged", "contact_at_q"):
         np.testing.assert_array_equal(here[f"{name}_{column}"], there[f"{name}_{column}"], err_msg=column)
-    # objects bounce on each other for a few steps, which another solver does not repeat: not at half the time step either
+    # objects bounce on each other for a few steps: another solver, or half the time step, does not repeat that
     for column, bound in (("object_displacement", 2e-3), ("penetration", 1.5e-3), ("slip", 2e-4)):
         kept = [0, 3]
         np.testing.assert_allclose(
