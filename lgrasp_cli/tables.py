@@ -99,9 +99,9 @@ def _wrapped(text: str, width: int) -> list[str]:
     return textwrap.wrap(text, width) if len(text) > width else [text]
 
 
-def share(part: int, whole: int) -> str:
+def share(part: int | None, whole: int) -> str:
     """``12.5%``, or a dash of nothing."""
-    return f"{part / whole:.1%}" if whole else "-"
+    return f"{part / whole:.1%}" if whole and part is not None else "-"
 
 
 def counted(data: dict[str, Any], unit: str) -> str:

@@ -146,6 +146,15 @@ def test_several_objects(cli, tmp_path):
     assert [entry["name"] for entry in objects] == ["one", "two"]
 
 
+def test_one_object_beside_several(cli, grasps):
+    """Whether objects stay is told of several only."""
+    write_shard(grasps / "twins.h5", twin_shard(twin_rows()))
+    result = cli("simulate", grasps)
+    assert result.code == 0, result
+    heads, *lines = (line.split() for line in result.out.splitlines()[:3])
+    assert {line[1]: line[heads.index("stay")] for line in lines} == {"cube": "-", "one+two": "100.0%"}
+
+
 def test_goes_on_where_it_was(cli, grasps, tmp_path):
     """What is there stays byte for byte; damage is made anew; a second protocol adds its own columns."""
     out = tmp_path / "verdicts"
