@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from lgrasp.dataset.scenes import SceneRows
-from lgrasp.errors import LgraspError
+from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.notices import notice
 from lgrasp.view.figure import STAGE_MARKS, GraspFigure, Marks
 from lgrasp.view.front import row_link
@@ -23,6 +23,7 @@ _APART = 0.3  # [m]
 _SPEED = 0.8  # stages a second
 _PAUSE = 1.0  # stages, at the end
 _AS_STORED = "as stored"
+_READ = 10.0  # [s] that a message stays
 
 
 class RowsView(View):
@@ -47,6 +48,7 @@ class RowsView(View):
         """Rows on the screen."""
         self.told = ""
         """What is said of the first of them, Markdown."""
+        self._met = ""  # conditions that hold for all of order
         self._clock: float | None = None
         rows.place(row)
         first = rows.scene(row)
@@ -60,6 +62,7 @@ class RowsView(View):
         self._text = gui.add_markdown("")
         with gui.add_folder("choose"):
             self._where = gui.add_text("where", where, hint="such as metrics/epsilon > 0.05, physics/fc_holds")
+            apply = gui.add_button("apply")
             metrics = [name for name in rows.columns() if name != "candidate"]
             self._sort = gui.add_dropdown("sort by", (_AS_STORED, *metrics), initial_value=_AS_STORED)
             self._falling = gui.add_checkbox("largest first", True)
@@ -72,11 +75,12 @@ class RowsView(View):
         self._time.on_update(self._guarded(lambda: self.move(self._time.value)))
         for box in self._marks:
             box.on_update(self._guarded(self._mark))
-        for control in (self._where, self._sort, self._falling):
-            control.on_update(self._guarded(self._choose))
+        apply.on_click(self._guarded(self._apply))
+        for control in (self._sort, self._falling):
+            control.on_update(self._guarded(lambda: self._choose(self._met)))
         self._step.on_click(self._guarded(lambda: self._go(1 if self._step.value == "next" else -1)))
         if where:
-            self._choose()
+            self._choose(where)
             nearest = int(np.argmin(np.abs(np.asarray(self.order) - row)))
             if row and self.order[nearest] != row:
                 notice(f"row {row:,} does not satisfy the conditions; row {self.order[nearest]:,} is shown")
@@ -98,7 +102,7 @@ class RowsView(View):
         with self._lock:
             if row not in self.order:
                 self._where.value = ""
-                self._choose()
+                self._choose("")
             position = int(np.flatnonzero(np.asarray(self.order) == row)[0])
             self.show(position, int(self._side.value))
             self._at.value = position
@@ -123,7 +127,7 @@ class RowsView(View):
                     action()
                 except LgraspError as error:
                     for client in self._server.get_clients().values():
-                        client.add_notification("this does not work", str(error), color="red")
+                        client.add_notification("this does not work", str(error), color="red", auto_close_seconds=_READ)
 
         return call
 
@@ -147,7 +151,7 @@ class RowsView(View):
             values = self._rows.column(sort)[np.asarray(order)]
             order = np.asarray(order)[np.argsort(-values if falling else values, kind="stable")]
         with self._lock:
-            self.order = order
+            self.order, self._met = order, where
             self._at.max = max(len(order) - 1, 1)
             self._at.value = 0
             self.show(0, side)
@@ -186,9 +190,14 @@ class RowsView(View):
             for figure in self._figures:
                 figure.move(time)
 
-    def _choose(self) -> None:
-        falling, side = self._falling.value, int(self._side.value)
-        self.choose(self._where.value, self._sort.value, falling=falling, side=side)
+    def _choose(self, where: str) -> None:
+        self.choose(where, self._sort.value, falling=self._falling.value, side=int(self._side.value))
+
+    def _apply(self) -> None:
+        try:
+            self._choose(self._where.value)
+        except LgraspError as error:
+            raise ConfigError(f"{error}; still shown: {self._met or 'all rows'}") from None
 
     def _show(self) -> None:
         self.show(int(self._at.value), int(self._side.value))

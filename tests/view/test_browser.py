@@ -33,12 +33,12 @@ def test_rows_of_a_shard(opened, page):
     tab.get_by_text("row 1", exact=True).wait_for()
     tab.get_by_text("link to this row").click()  # the page is loaded again
     tab.get_by_text("row 1", exact=True).wait_for()
-    where = control(tab, "where")
+    where, apply = control(tab, "where"), tab.get_by_role("button", name="apply")
     where.fill("metrics/nothing > 0.1")
-    where.press("Enter")
-    tab.get_by_text("no column 'metrics/nothing'").wait_for()
+    apply.click()
+    tab.get_by_text("no column 'metrics/nothing'").filter(has_text="still shown: all rows").wait_for()
     where.fill("metrics/epsilon > 0.1")
-    where.press("Enter")
+    apply.click()
     tab.get_by_text("row 1", exact=True).wait_for(state="detached")
     with tab.expect_download() as download:
         tab.get_by_text("save model (GLB)").click()
