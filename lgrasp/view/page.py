@@ -5,11 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
+from PIL import Image
 from trimesh.exchange.gltf import export_glb
 
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.draw import ANGLE, choose_viewpoint
-from lgrasp.picture.sheet import image_bytes, sheet
+from lgrasp.picture.sheet import image_bytes
 from lgrasp.view.server import View
 
 if TYPE_CHECKING:
@@ -53,8 +54,9 @@ def add_saving(server: "viser.ViserServer", view: View, name: str) -> None:
         client = event.client
         if client is not None:
             size = client.camera.image_height, client.camera.image_width
-            seen = client.get_render(*size, transport_format="png", timeout=_PATIENCE)
-            client.send_file_download(f"{name}.png", image_bytes(sheet([seen[..., :3]])), save_immediately=True)
+            seen = Image.fromarray(client.get_render(*size, transport_format="png", timeout=_PATIENCE))
+            image = Image.alpha_composite(Image.new("RGBA", seen.size, "#ffffff"), seen).convert("RGB")
+            client.send_file_download(f"{name}.png", image_bytes(image), save_immediately=True)
 
     @model.on_click
     def _(event: "viser.GuiEvent") -> None:

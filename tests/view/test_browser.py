@@ -48,6 +48,7 @@ def test_rows_of_a_shard(opened, page):
         tab.get_by_text("save picture (PNG)").click()
     with Image.open(download.value.path()) as picture:
         assert orange(picture) > 50
+        assert picture.getpixel((0, 0)) == (255, 255, 255)
     tab.goto(f"{tab.url}row/7")  # which does not meet the condition
     tab.get_by_text("row 7", exact=True).wait_for()
     assert control(tab, "where").input_value() == ""
