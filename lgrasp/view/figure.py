@@ -19,6 +19,7 @@ FORCE = "#1f4fd1"
 NORMAL = "#1a1a1a"
 _DOT = 0.003  # [m]
 _NORMAL = 0.02  # [m]
+_THIN = 0.001  # [m]
 _FORCE = 0.08  # [m] of the sum of the normal forces
 _CONE = 0.018  # [m]
 
@@ -140,7 +141,7 @@ class GraspFigure:
             self._marks.append(add_mesh(scene, f"{name}/contacts", balls(points, _DOT), CONTACT))
         if marks.normals:
             lines = np.stack([points, points + _NORMAL * normals], 1)
-            self._marks.append(scene.add_line_segments(f"{name}/normals", lines, colors=rgb(NORMAL)))
+            self._marks.append(scene.add_line_segments(f"{name}/normals", lines, rgb(NORMAL), thickness=_THIN))
         if marks.forces and np.isfinite(forces).all():
             arrows = np.stack([points - _FORCE * forces, points], 1)
             self._marks.append(
