@@ -16,15 +16,11 @@ def joints_above(joints: Iterable[Joint], link: str) -> list[Joint]:
     return found
 
 
-def link_poses(urdf: Urdf, base_link: str, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """``T_base_link`` of every link, each shape [n, 4, 4].
-
-    Args:
-        base_link: link whose frame the poses are given in.
-        values: positions [rad or m], shape [n], of joints by name; others follow the joint that they mimic, or are 0.
-    """
+def joint_values(joints: Iterable[Joint], values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Positions [rad or m] of all movable joints by name, from those of some, shape [n]: others follow the joint that
+    they mimic, or are 0."""
     rows = len(next(iter(values.values()), np.zeros(1)))
-    by_name = {joint.name: joint for joint in urdf.joints}
+    by_name = {joint.name: joint for joint in joints}
 
     def value(name: str) -> np.ndarray:
         mimic = by_name[name].mimic
@@ -32,9 +28,21 @@ def link_poses(urdf: Urdf, base_link: str, values: Mapping[str, np.ndarray]) -> 
             return np.asarray(values[name], float)
         return np.zeros(rows) if mimic is None else mimic[1] * value(mimic[0]) + mimic[2]
 
+    return {name: value(name) for name, joint in by_name.items() if joint.movable}
+
+
+def link_poses(urdf: Urdf, base_link: str, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """``T_base_link`` of every link, each shape [n, 4, 4].
+
+    Args:
+        base_link: link whose frame the poses are given in.
+        values: of :func:`joint_values`, of some joints.
+    """
+    rows = len(next(iter(values.values()), np.zeros(1)))
+    at = joint_values(urdf.joints, values)
     poses = {urdf.root: np.tile(np.eye(4), (rows, 1, 1))}
     for joint in urdf.joints:
         T = poses[joint.parent] @ joint.T_parent_joint
-        poses[joint.child] = T @ joint.motion(value(joint.name)) if joint.movable else T
+        poses[joint.child] = T @ joint.motion(at[joint.name]) if joint.movable else T
     T_base_root = np.linalg.inv(poses[base_link])
     return {link: T_base_root @ poses[link] for link in urdf.links}

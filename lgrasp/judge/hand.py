@@ -106,7 +106,8 @@ def read_solids(link: int, node: ET.Element, resolve: Callable[[str], trimesh.Tr
     geometry = node.find("geometry")
     shape = geometry[0] if geometry is not None and len(geometry) else ET.Element("nothing")
     if shape.tag == "mesh":
-        mesh, scale = resolve(str(shape.get("filename"))), floats(shape.get("scale"), (1, 1, 1))
+        mesh, factors = resolve(str(shape.get("filename"))), (shape.get("scale") or "1").split()
+        scale = floats(" ".join(factors * 3 if len(factors) == 1 else factors), (1, 1, 1))
         return mesh_solids(link, T, clean_mesh(np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces)))
     kinds = {"box": BoxSolid, "sphere": SphereSolid, "cylinder": CylinderSolid, "capsule": CylinderSolid}
     if shape.tag not in kinds:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError, short_reason
-from lgrasp.hand.links import joints_above
+from lgrasp.hand.links import joint_values, joints_above
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.assemble import OBJECT, TABLE, assemble
 from lgrasp.simulate.protocol import Protocol
@@ -50,7 +50,7 @@ class Model:
     columns: np.ndarray
     """Columns of q in the order of the controls."""
     held: dict[str, tuple[int, float]]
-    """Joints above the base link: column and the value at which they are welded [rad or m]."""
+    """Joints of q that are welded: column and the value at which they are welded [rad or m]."""
     object_address: np.ndarray
     """(O, 7) places of each object's position and quaternion in qpos."""
     object_velocity: np.ndarray
@@ -78,7 +78,7 @@ def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequen
     """Compile a hand with some objects of its scene; the last few are kept.
 
     Args:
-        q: one row of joint positions (K,) [rad or m]; joints above the base link are welded there.
+        q: one row of joint positions (K,) [rad or m]; joints above the base link, and what mimics them, are welded.
         objects: positions in ``scene.objects``; one may be there twice.
 
     Raises:
@@ -87,8 +87,12 @@ def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequen
     import_mujoco()
     hand = scene.hand.record
     column = {name: k for k, name in enumerate(hand.joint_names)}
-    above = [joint.name for joint in joints_above(scene.hand.joints, hand.base_link)]
-    held = tuple((name, float(q[column[name]])) for name in above if name in column)
+    joints = scene.hand.joints
+    still = {joint.name for joint in joints_above(joints, hand.base_link)}
+    while more := {joint.name for joint in joints if joint.mimic and joint.mimic[0] in still} - still:
+        still |= more
+    values = joint_values(joints, {name: q[k : k + 1] for name, k in column.items()})
+    held = tuple((name, float(value[0])) for name, value in values.items() if name in still)
     return _build(scene, protocol.model_dump_json(), held, tuple(objects))
 
 
@@ -131,7 +135,7 @@ def _build(scene: Scene, text: str, held: tuple[tuple[str, float], ...], objects
         joint_matrix=matrix,
         joint_offset=offset,
         columns=np.array([column.get(name, -1) for name in driven]),
-        held={name: (column[name], value) for name, value in held},
+        held={name: (column[name], value) for name, value in held if name in column},
         object_address=model.jnt_qposadr[free][:, None] + np.arange(7),
         object_velocity=model.jnt_dofadr[free][:, None] + np.arange(6),
         object_body=bodies,

@@ -168,16 +168,21 @@ def test_holes_are_filled_before_a_mesh_is_cut():
     assert given[0].volume == pytest.approx(prism(YOU, 0.02).volume, rel=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["fixed", "revolute", "prismatic"])
-def test_what_carries_the_base_does_not_matter(jaws: Jaws, kind: str):
-    """The base on a turned mount, or on a joint that is held somewhere: poses and pulls are in the base's frame."""
+@pytest.mark.parametrize(("kind", "count"), [("fixed", 1), ("revolute", 1), ("prismatic", 1), ("prismatic", 3)])
+def test_what_carries_the_base_does_not_matter(jaws: Jaws, kind: str, count: int):
+    """The base on a turned mount, or on joints of which each follows the one before and the first is held somewhere:
+    poses and pulls are in the base's frame."""
     plain = jaws.shard(0.004)
     limit = '<limit lower="-1" upper="1" effort="1" velocity="1"/>' if kind != "fixed" else ""
-    mount = (
-        f'<link name="mount"/><joint name="w" type="{kind}"><parent link="mount"/><child link="base"/>'
-        f'<origin xyz="0.1 -0.2 0.3" rpy="0.3 -1.2 2"/><axis xyz="0 0.6 0.8"/>{limit}</joint></robot>'
-    )
-    urdf = plain.hand.urdf.replace("</robot>", mount)
+    urdf = plain.hand.urdf
+    for joint, before, link in [("w", "", "base"), ("v", "w", "m w"), ("u", "v", "m v")][:count]:
+        mimic = f'<mimic joint="{before}" multiplier="0.5" offset="0.1"/>' if before else ""
+        mount = (
+            f'<link name="m {joint}"/><joint name="{joint}" type="{kind}"><parent link="m {joint}"/>'
+            f'<child link="{link}"/><origin xyz="0.1 -0.2 0.3" rpy="0.3 -1.2 2"/><axis xyz="0 0.6 0.8"/>{limit}{mimic}'
+            "</joint></robot>"
+        )
+        urdf = urdf.replace("</robot>", mount)
     names = ("l", "r") if kind == "fixed" else ("l", "r", "w")
     rows = plain.grasps
     if kind != "fixed":

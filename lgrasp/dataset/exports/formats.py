@@ -24,8 +24,9 @@ from lgrasp.dataset.exports.folder import (
 from lgrasp.dataset.exports.graspgen import GRASPGEN_NOTES, read_graspgen, write_graspgen
 from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
-from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, mujoco_hand, read_mjcf
+from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
 from lgrasp.dataset.exports.options import check_options
+from lgrasp.dataset.exports.plain_hand import plain_hand
 from lgrasp.dataset.exports.reading import GraspSet
 from lgrasp.dataset.exports.selection import Selection, select_rows
 from lgrasp.dataset.exports.usd import USD_NOTES, UsdWriter, read_usd
@@ -34,7 +35,6 @@ from lgrasp.dataset.files import Paths
 from lgrasp.dataset.split import Split
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.files import write_file
-from lgrasp.grasp.records import HandRecord
 
 
 class Format(NamedTuple):
@@ -50,8 +50,6 @@ class Format(NamedTuple):
     Raises ShardError at a damaged shard, OutputError where the folder cannot be written.
     """
     read: Callable[..., GraspSet]
-    hand: Callable[[HandRecord], HandRecord] = lambda hand: hand
-    """The hand as the other program can read it."""
 
 
 def _plain(write: Callable[[Selection, HandFrames, Path, Callable[[int], None]], None]):
@@ -65,7 +63,7 @@ FORMATS = {
     "isaac-grasp": Format(True, ISAAC_GRASP_NOTES, _plain(write_isaac_grasp), read_isaac_grasp),
     "graspgen": Format(True, GRASPGEN_NOTES, _plain(write_graspgen), read_graspgen),
     "usd": Format(True, USD_NOTES, UsdWriter, read_usd),
-    "mjcf": Format(False, MJCF_NOTES, MjcfWriter, read_mjcf, mujoco_hand),
+    "mjcf": Format(False, MJCF_NOTES, MjcfWriter, read_mjcf),
     "webdataset": Format(True, WEBDATASET_NOTES, webdataset_writer, read_webdataset),
 }
 """Formats by the name that ``--to`` takes."""
@@ -128,7 +126,7 @@ def export_shards(
         check_empty(out, run_key)
     parts = Split.read(split) if split is not None else None
     selection = select_rows(paths, where=conditions, limit=limit, single=form.single, split=parts)
-    selection = replace(selection, hand=form.hand(selection.hand))
+    selection = replace(selection, hand=plain_hand(selection.hand))
     frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
     write = form.writer(selection, frames, cut)
     chosen = list(map(str, conditions))

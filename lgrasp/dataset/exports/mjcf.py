@@ -1,9 +1,8 @@
 """MJCF: one MuJoCo scene per grasp, with keyframes before closing, at the grasp and squeezing."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import cache, lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,17 +10,14 @@ from lxml import etree
 from trimesh import Trimesh
 
 from lgrasp.dataset.exports.folder import GRASPS, HAND, OBJECTS, mesh_text, object_text
-from lgrasp.dataset.exports.hand import HandFrames, free_name, hand_files
+from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.reading import WRONG, GraspSet, open_folder, order_of
 from lgrasp.dataset.exports.selection import Selection
 from lgrasp.dataset.files import parsing
 from lgrasp.errors import PhysicsError, ShardError, short_reason
 from lgrasp.files import write_file
 from lgrasp.geometry.poses import inverse
-from lgrasp.grasp.hand_files import checked_urdf
-from lgrasp.grasp.records import HandRecord, ObjectRecord
-from lgrasp.hand.geometry import read_mesh
-from lgrasp.hand.urdf import parse_robot
+from lgrasp.grasp.records import ObjectRecord
 from lgrasp.object.mass import MassProperties, mass_properties
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.builder import add_drive, set_compiler, set_contact, set_joint, set_mass, set_options
@@ -56,37 +52,6 @@ An object collides with the convex pieces objects/CODE/piece_NN.obj; where there
 which fills its hollows. A mesh of the hand collides with its hull; links whose hulls overlap at the grasp are kept from
 colliding with each other.
 """
-
-
-def mujoco_hand(hand: HandRecord) -> HandRecord:
-    """The hand with meshes that MuJoCo reads: those of other formats become OBJ.
-
-    Raises:
-        ShardError: A mesh is missing or cannot be read.
-        HandError: The URDF cannot be used.
-    """
-    others = [name for name, data in hand.meshes.items() if not _readable(name, data)]
-    if not others:
-        return hand
-    meshes, names = dict(hand.meshes), {}
-    with checked_urdf(hand) as urdf:
-        for name in (name for name in others if name in urdf.mesh_files):
-            try:
-                text = mesh_text(read_mesh(urdf.mesh_files[name]))
-            except Exception as error:  # any parser error means the same to the user
-                raise ShardError(f"hand '{hand.name}': mesh '{name}' cannot be read: {short_reason(error)}") from None
-            names[name] = free_name(name.rpartition(".")[0], ".obj", meshes)
-            meshes[names[name]] = text.encode()
-    robot, _ = parse_robot(Path(hand.name), hand.urdf.encode())
-    for mesh in robot.iter("mesh"):
-        mesh.set("filename", names.get(mesh.get("filename"), mesh.get("filename", "")))
-    return replace(hand, urdf=etree.tostring(robot, encoding="unicode"), meshes=meshes)
-
-
-def _readable(name: str, data: bytes) -> bool:
-    """True for a mesh that MuJoCo reads; STL must be binary."""
-    suffix = PurePosixPath(name).suffix.lower()
-    return suffix == ".obj" or (suffix == ".stl" and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"))
 
 
 class Keyframe(NamedTuple):

@@ -17,6 +17,7 @@ from support.places import TINY_SHARD
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.plain_hand import plain_hand
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.object.mass import mass_properties
 
@@ -303,14 +304,36 @@ def test_a_real_hand_can_be_used_alone(tmp_path, shards):
     )
 
 
-def test_joints_may_mimic_those_that_mimic(caplog):
-    joint = """<link name="{0}"/><joint name="{0}" type="revolute"><parent link="{1}"/><child link="{0}"/>{2}
-        <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
-    chain = (("b", "a", ""), ("c", "b", '<mimic joint="b" multiplier="2"/>'), ("d", "c", '<mimic joint="c"/>'))
-    urdf = f'<robot name="r"><link name="a"/>{"".join(joint.format(*j) for j in chain)}</robot>'
-    frames = HandFrames(urdf, "c", ("b",), Path("a.h5"))
-    assert frames.all_joints(np.array([[0.1]]))["d"] == pytest.approx(0.2)
-    frames.base_from_root(np.array([[0.1]]))
+def test_the_hand_says_all_in_the_plainest_way(caplog, shards):
+    """Joints that mimic such as mimic others, fixed ones that mimic, axes of any length, one number for three scales,
+    corners that no face uses: not every program knows them."""
+    joint = """<link name="{0}"/><joint name="{0}" type="{3}"><parent link="{1}"/><child link="{0}"/>{2}
+        <axis xyz="0 0 3"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>"""
+    chain = (
+        ("b", "a", "", "prismatic"),
+        ("c", "b", '<mimic joint="b" multiplier="2"/>', "prismatic"),
+        ("d", "c", '<mimic joint="c" offset="0.1"/>', "prismatic"),
+        ("e", "d", '<mimic joint="b"/>', "fixed"),
+    )
+    mesh = '<link name="a"><collision><geometry><mesh filename="m.obj" scale="0.1"/></geometry></collision></link>'
+    urdf = f'<robot name="r">{mesh}{"".join(joint.format(*j) for j in chain)}</robot>'
+    corners = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    hand = replace(
+        shards.hand("barrett"),
+        urdf=urdf,
+        base_link="e",
+        link_names=(*"abcde",),
+        joint_names=("b",),
+        meshes={"m.obj": corners + b"v 9 9 9\n"},
+    )
+    plain = plain_hand(hand)
+    assert max(len(line.split()) for line in plain.meshes["m_2.obj"].splitlines()) == 4
+    assert plain.meshes["m_2.obj"].count(b"\nv ") == 4
+    assert 'scale="0.1 0.1 0.1"' in plain.urdf
+    frames = HandFrames(plain.urdf, "e", ("b",), Path("a.h5"))
+    assert frames.mimics == {"c": ("b", 2.0, 0.0), "d": ("b", 2.0, 0.1)}
+    assert frames.all_joints(np.array([[0.1]]))["d"] == pytest.approx(0.3)
+    np.testing.assert_allclose(frames.base_from_root(np.array([[0.1]]))[0, :3], [0, 0, -0.6], atol=1e-12)
     assert not caplog.records  # yourdfpy's
 
 
