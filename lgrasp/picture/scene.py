@@ -74,6 +74,8 @@ class ContactMarks(NamedTuple):
     """Outward unit normals of the object, shape (c, 3)."""
     forces: np.ndarray
     """Of the hand on the object, shape (c, 3); normal parts sum to 1."""
+    of: np.ndarray
+    """Which object of the row, shape (c,)."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ def scene_of_row(hand: HandShape, objects: Sequence[ObjectRecord], rows: GraspRo
     numbers = [poses, points, normals, *(q for step in steps for q in step.stages.values())]
     if not all(np.isfinite(values).all() for values in numbers):
         raise ShardError("poses, contacts or joints are not finite")
-    return GraspScene(hand, tuple(placed), ContactMarks(points + poses[of, :3, 3], normals, forces), steps)
+    return GraspScene(hand, tuple(placed), ContactMarks(points + poses[of, :3, 3], normals, forces, of), steps)
 
 
 def split_edges(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

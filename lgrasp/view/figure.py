@@ -1,6 +1,6 @@
 """A hand, objects and contacts in the scene of a viewer."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -34,8 +34,11 @@ class Marks(NamedTuple):
     see_through: bool = False
 
 
-STAGE_MARKS = tuple((float(i), name) for i, name in enumerate(STAGES))
-"""Names of the first times of :meth:`GraspScene.at`, for a slider."""
+def stage_marks(duration: float) -> tuple[tuple[float, str], ...]:
+    """What to write at the times of :meth:`GraspScene.at` on a slider: the stages, or of a sequence its grasps."""
+    if duration < len(STAGES):
+        return tuple((float(i), name) for i, name in enumerate(STAGES))
+    return tuple((time, f"object {i}") for i, time in enumerate(np.arange(1.0, duration, len(STAGES)).tolist(), 1))
 
 
 def show_all(nodes: "Iterable[viser.SceneNodeHandle]", visible: bool) -> None:
@@ -91,7 +94,7 @@ class GraspFigure:
         self.frame = scene.add_frame(name, show_axes=False)
         self._hand: HandFigure | None = None
         self._objects: list[tuple[ObjectRecord, viser.MeshHandle]] = []
-        self._marks: list[viser.SceneNodeHandle] = []
+        self._marks: list[tuple[int, viser.SceneNodeHandle]] = []  # with the object that is touched
         self.shown: GraspScene | None = None
         self._time = 0.0
 
@@ -121,39 +124,43 @@ class GraspFigure:
         self._time = time
         q, held = self.shown.at(time)
         self._hand.move(q)
-        for i, (_, node) in enumerate(self._objects):
+        for i, node in [*enumerate(node for _, node in self._objects), *self._marks]:
             node.visible = i < held
 
     def mark(self, marks: Marks, friction: float) -> None:
-        """Show contacts and what acts there."""
-        for node in self._marks:
+        """Show contacts and what acts there, of the objects in the hand."""
+        for _, node in self._marks:
             node.remove()
-        self._marks = []
         assert self.shown is not None
         assert self._hand is not None
         for mesh in self._hand.meshes.values():
             mesh.opacity = 0.35 if marks.see_through else None
-        points, normals, forces = self.shown.contacts
-        if not len(points):
-            return
-        scene, name = self._scene, self.name
+        of = self.shown.contacts.of
+        self._marks = [(int(i), node) for i in np.unique(of) for node in self._marked(marks, friction, of == i, i)]
+        self.move(self._time)
+
+    def _marked(
+        self, marks: Marks, friction: float, chosen: np.ndarray, number: int
+    ) -> "Iterator[viser.SceneNodeHandle]":
+        """Nodes of the contacts of one object."""
+        assert self.shown is not None
+        points, normals, forces, _ = (values[chosen] for values in self.shown.contacts)
+        scene, name = self._scene, f"{self.name}/marks{number}"
         if marks.contacts:
-            self._marks.append(add_mesh(scene, f"{name}/contacts", balls(points, _DOT), CONTACT))
+            yield add_mesh(scene, f"{name}/contacts", balls(points, _DOT), CONTACT)
         if marks.normals:
             lines = np.stack([points, points + _NORMAL * normals], 1)
-            self._marks.append(scene.add_line_segments(f"{name}/normals", lines, rgb(NORMAL), thickness=_THIN))
+            yield scene.add_line_segments(f"{name}/normals", lines, rgb(NORMAL), thickness=_THIN)
         if marks.forces and np.isfinite(forces).all():
             arrows = np.stack([points - _FORCE * forces, points], 1)
-            self._marks.append(
-                scene.add_arrows(
-                    f"{name}/forces", arrows, rgb(FORCE), shaft_radius=0.001, head_radius=0.0025, head_length=0.007
-                )
+            yield scene.add_arrows(
+                f"{name}/forces", arrows, rgb(FORCE), shaft_radius=0.001, head_radius=0.0025, head_length=0.007
             )
         if marks.cones:
             cone = trimesh.creation.cone(_CONE * friction, _CONE).apply_translation([0, 0, -_CONE])
             turns = [trimesh.geometry.align_vectors([0, 0, -1], normal) for normal in normals]
             cones = [cone.copy().apply_transform(T).apply_translation(p) for T, p in zip(turns, points, strict=True)]
-            self._marks.append(add_mesh(scene, f"{name}/cones", joined_mesh(cones), FORCE, opacity=0.35))
+            yield add_mesh(scene, f"{name}/cones", joined_mesh(cones), FORCE, opacity=0.35)
 
     def meshes(self) -> dict[str, trimesh.Trimesh]:
         """What is shown, without marks, in the frame of the node."""

@@ -10,7 +10,7 @@ import trimesh
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.notices import notice
-from lgrasp.view.figure import STAGE_MARKS, GraspFigure, Marks
+from lgrasp.view.figure import GraspFigure, Marks, stage_marks
 from lgrasp.view.front import row_link
 from lgrasp.view.page import Aim, add_saving
 from lgrasp.view.server import View
@@ -52,12 +52,12 @@ class RowsView(View):
         self._clock: float | None = None
         rows.place(row)
         first = rows.scene(row)
-        links = list(first.hand.placed(first.at(1.0)[0]).values())
+        links = list(first.hand.placed(first.at(first.duration - 1)[0]).values())
         self._aim = Aim(links, [placed.placed for placed in first.objects], first.contacts.points)
         gui = server.gui
         self._at = gui.add_slider("grasp", 0, max(len(rows) - 1, 1), 1, row)
         self._step = gui.add_button_group("", ("previous", "next"))
-        self._time = gui.add_slider("stage", 0.0, first.duration, 0.01, 1.0, marks=STAGE_MARKS)
+        self._time = self._add_time(first.duration)
         self._play = gui.add_checkbox("play", False)
         self._text = gui.add_markdown("")
         with gui.add_folder("choose"):
@@ -72,7 +72,6 @@ class RowsView(View):
         add_saving(server, self, "grasps")
         self._at.on_update(self._guarded(self._show))
         self._side.on_update(self._guarded(self._show))
-        self._time.on_update(self._guarded(lambda: self.move(self._time.value)))
         for box in self._marks:
             box.on_update(self._guarded(self._mark))
         apply.on_click(self._guarded(self._apply))
@@ -89,12 +88,13 @@ class RowsView(View):
 
     def tick(self, seconds: float) -> None:
         """Go on with the animation, if it runs."""
-        if self._play.value:
-            end = self._time.max + _PAUSE
-            self._clock = (self._clock + _SPEED * seconds) % end if self._clock is not None else 0.0
-            self._time.value = min(self._clock, self._time.max)
-        else:
-            self._clock = None
+        with self._lock:
+            if self._play.value:
+                end = self._time.max + _PAUSE
+                self._clock = (self._clock + _SPEED * seconds) % end if self._clock is not None else 0.0
+                self._time.value = min(self._clock, self._time.max)
+            else:
+                self._clock = None
 
     def go(self, row: int) -> None:
         """Show a row, counted through all shards; of all rows, if it does not meet the conditions."""
@@ -178,7 +178,10 @@ class RowsView(View):
                 figure.frame.position = place
             if len(chosen) != len(self.shown):
                 self._aim.apply(self._server, (places[0] + places[-1]) / 2, columns * (1 if columns == 1 else 1.2))
-            self._time.max = max(scene.duration for scene in scenes)
+            duration = max(scene.duration for scene in scenes)
+            if duration != self._time.max:
+                before, self._time = self._time, self._add_time(duration, self._time.order)
+                before.remove()
             self.shown, self.told = chosen, self._described(chosen)
             self._text.content = self.told
             self.move(self._time.value)
@@ -189,6 +192,14 @@ class RowsView(View):
         with self._lock, self._server.atomic():
             for figure in self._figures:
                 figure.move(time)
+
+    def _add_time(self, duration: float, order: float | None = None) -> "viser.GuiSliderHandle[float]":
+        """A slider of the stages, at the last grasp."""
+        slider = self._server.gui.add_slider(
+            "stage", 0.0, duration, 0.01, duration - 1, marks=stage_marks(duration), order=order
+        )
+        slider.on_update(self._guarded(lambda: self.move(self._time.value)))
+        return slider
 
     def _choose(self, where: str) -> None:
         self.choose(where, self._sort.value, falling=self._falling.value, side=int(self._side.value))

@@ -11,7 +11,7 @@ from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.draw import OBJECTS, rgb
 from lgrasp.picture.scene import STAGES, ContactMarks, GraspScene, HandShape, PlacedObject, Step
 from lgrasp.scenes.records import SceneRecord
-from lgrasp.view.figure import STAGE_MARKS, GraspFigure, add_mesh, painted, place, show_all
+from lgrasp.view.figure import GraspFigure, add_mesh, painted, place, show_all, stage_marks
 from lgrasp.view.front import row_link
 from lgrasp.view.page import Aim, add_saving
 from lgrasp.view.server import View
@@ -65,7 +65,7 @@ class TableView(View):
             free = int(scene.grasps.collision_free.sum())
             gui.add_markdown(f"{free:,} grasps are free of collision; the other {len(self._rows) - free:,} come last.")
             self._at = gui.add_slider("grasp", 0, max(len(self._rows) - 1, 1), 1, 0)
-            self._time = gui.add_slider("stage", 0.0, 2.0, 0.01, 1.0, marks=STAGE_MARKS)
+            self._time = gui.add_slider("stage", 0.0, 2.0, 0.01, 1.0, marks=stage_marks(2.0))
             self._text = gui.add_markdown("")
             self._at.on_update(lambda _: self._show())
             self._time.on_update(lambda _: self._show())
@@ -95,7 +95,7 @@ class TableView(View):
         assert self._figure is not None
         grasps, row = self._scene.grasps, int(self._rows[min(int(self._at.value), len(self._rows) - 1)])
         stages = {name: getattr(grasps, column)[row] for name, column in STAGES.items()}
-        nothing = ContactMarks(*(np.zeros((0, 3)) for _ in range(3)))
+        nothing = ContactMarks(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0, int))
         with self._server.atomic():
             self._figure.show(GraspScene(self._shape, (), nothing, (Step(stages, 0),)))
             place(self._figure.frame, pose_matrix(np.asarray(grasps.hand_pose[row], float)))

@@ -1,16 +1,21 @@
 """What the viewer shows, by what it holds; no browser."""
 
 import sys
+from dataclasses import replace
 from http.client import HTTPConnection
 
 import numpy as np
 import pytest
 from support.jaws import jaw_rows, jaw_shard
 from support.places import TINY_SHARD
+from support.twins import twin_rows, twin_shard
 
 from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ConfigError
+from lgrasp.grasp.records import SequenceRows
 from lgrasp.picture.camera import Intrinsics
+from lgrasp.picture.scene import STAGES, HandShape, scene_of_row
 from lgrasp.scenes.files import write_scene
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
 
@@ -109,6 +114,36 @@ def test_time_moves_the_hand(rows):
         rows.move(time)
         tips.append(np.concatenate([m.vertices for n, m in rows.meshes().geometry.items() if "tip" in n]))
     assert np.abs(tips[1] - tips[0]).max() > 0.001
+
+
+def test_a_sequence_begins_at_its_last_grasp(opened, tmp_path):
+    """With all objects; before it those that are held alone, to which contacts belong."""
+    rows = twin_rows(count=2)
+    rows.q_pregrasp[1, :2] = rows.q[1, :2]  # of the first object's gripper, in the second step
+    steps = {name: np.repeat(getattr(rows, name)[:, None], 2, 1) for name in STAGES.values()}
+    steps["q_pregrasp"][1, 0] = steps["q_pregrasp"][0, 0]
+    space, free = np.tile(np.array([0, 1], "i2"), (2, 1)), np.array([[[1, 1, 0, 0], [0, 0, 1, 1]]] * 2, bool)
+    names = "object_index", "contact_links", "object_pose", "contact_points", "contact_normals", "contact_forces"
+    changed = {name: getattr(rows, name).copy() for name in names}
+    free[0, 1] = False  # the first row has one object
+    for values in (space, *steps.values(), *changed.values()):
+        values[0, 1] = -1 if values.dtype.kind == "i" else np.nan
+    own = SequenceRows(space_names=("a", "b"), space=space, free_joints=free, parent=np.array([-1, 0]), **steps)
+    shard = twin_shard(replace(rows, **changed, sequence=own))
+    write_shard(tmp_path / "a.h5", shard)
+    both = scene_of_row(HandShape.of_record(shard.hand), shard.objects, shard.grasps, 1)
+    assert both.contacts.of.tolist() == [0, 0, 1, 1]
+    view = opened(tmp_path, row=1)[1]
+
+    def shown() -> set[str]:
+        return {name.rpartition("/")[2] for name in view.meshes().geometry if "object" in name}
+
+    assert shown() == {"object0", "object1"}
+    view.move(1.0)
+    assert shown() == {"object0"}
+    view.go(0)
+    view.go(1)  # which has more steps
+    assert shown() == {"object0", "object1"}
 
 
 def test_a_hand_takes_postures(hand):
