@@ -200,8 +200,8 @@ class SceneRows:
         """What tells a row from others: its number, and hand and objects where these differ."""
         names = {}
         for r in (row, *among):
-            hand, objects, _ = self._contents(self.place(r)[0])
-            names[r] = hand.name, " + ".join(o.id for o in objects)
+            hand, objects, rows = self.read(r)
+            names[r] = hand.name, " + ".join(objects[k].id for k in rows.object_index[0] if 0 <= k < len(objects))
         differing = [k for k in (0, 1) if len({n[k] for n in names.values()}) > 1]
         return " · ".join([*(names[row][k] for k in differing), f"row {row:,}"])
 

@@ -48,6 +48,15 @@ def test_captions_tell_what_differs(folder):
     assert rows.caption(4, [0, 4]) == "other · row 4"
 
 
+def test_captions_name_what_a_row_holds(tmp_path, make_sequence):
+    shard = make_sequence((1, 1))
+    write_shard(tmp_path / "a.h5", shard)
+    first, second = (shard.objects[k].id for k in shard.grasps.object_index[1, :2])
+    rows = SceneRows(tmp_path)
+    assert rows.caption(0, [0, 1]) == f"{first} · row 0"
+    assert rows.caption(1, [0, 1]) == f"{first} + {second} · row 1"
+
+
 def test_rows_that_are_not_there(folder, tmp_path):
     with pytest.raises(ConfigError, match="row 5 does not exist; there are 0 to 4"):
         SceneRows(folder).scene(5)
