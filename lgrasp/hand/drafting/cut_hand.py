@@ -69,6 +69,19 @@ def hand_roots(robot: etree._Element) -> list[str]:
     return inner if moves_more else []
 
 
+def _mimics_outside(links: _Links, root: str) -> tuple[str, str, str] | None:
+    """A joint below a link that mimics one which is not, that one, and the link above that one."""
+    kept, every = set(links.subtree(root)), {joint.get("name", ""): joint for joint in links.joints}
+    for name, joint in every.items():
+        mimic = joint.find("mimic")
+        source = "" if mimic is None else mimic.get("joint", "")
+        if joint_end(joint, "parent") in kept and source in every:
+            above = joint_end(every[source], "parent")
+            if above not in kept:
+                return name, source, above
+    return None
+
+
 def _whole_hand(links: _Links, link: str, dividing: set[str]) -> str:
     """The last link above a dividing one, itself at first, from which no arm leads to the dividing one before."""
     hand, joints, at = link, 0, link
@@ -99,17 +112,15 @@ def cut_hand(path: Path, robot: etree._Element, root: str) -> None:
     inside = [joint for joint in links.joints if joint_end(joint, "parent") in kept]
     if not any(joint.get("type") in MOVABLE for joint in inside):
         raise HandError(f"URDF {path}: no joint moves what is below link '{root}'; {choices}")
-    own, every = ({joint.get("name"): joint for joint in some} for some in (inside, links.joints))
-    for joint in inside:
-        mimic = joint.find("mimic")
-        source = None if mimic is None else mimic.get("joint")
-        if source in every and source not in own:
-            ways = links.above(joint_end(every[source], "parent"))
-            both = next((link for link in links.above(root) if link in ways), None)
-            raise HandError(
-                f"URDF {path}: joint '{joint.get('name')}' below link '{root}' mimics '{source}', which is not below "
-                f"it; --root {both} has both"
-            )
+    if outside := _mimics_outside(links, root):
+        whole: str | None = root
+        while whole and (more := _mimics_outside(links, whole)):
+            ways = links.above(more[2])
+            whole = next((link for link in links.above(whole) if link in ways), None)
+        raise HandError(
+            f"URDF {path}: joint '{outside[0]}' below link '{root}' mimics '{outside[1]}', which is not below it; "
+            f"--root {whole} has both"
+        )
     for element in list(robot):
         is_link, is_joint = element.tag == "link", element.tag == "joint"
         inner = (is_link and element.get("name") in kept) or (is_joint and joint_end(element, "parent") in kept)
