@@ -121,12 +121,14 @@ def _set_table(sets: list[dict[str, Any]]) -> TextTable:
     columns = ("hand", "object", "rows", "approach", "surface", "PCA 1", "PCA 5", "entropy", "std")
     rows = []
     for found in sets:
-        cover, spread = (next(iter(found[name].values())) for name in ("coverage", "diversity"))
-        ratio, entropy = spread["pca_ratio"], spread["joint_entropy"]
-        cells = [f"{cover[name]['share']:.1%}" for name in ("directions", "surface")]
-        cells += [f"{ratio[0]:.1%}", f"{ratio[-1]:.1%}"] if ratio else ["-", "-"]
-        cells += [f"{entropy[name]:.2f}" if entropy else "-" for name in ("mean", "std")]
-        rows.append((found["hand"], " + ".join(found["objects"]), f"{found['rows']:,}", *cells))
+        objects = " + ".join(found["objects"])
+        for one, cover in found["coverage"].items():
+            ratio, entropy = (found["diversity"][one][name] for name in ("pca_ratio", "joint_entropy"))
+            cells = [f"{cover[name]['share']:.1%}" for name in ("directions", "surface")]
+            cells += [f"{ratio[0]:.1%}", f"{ratio[-1]:.1%}"] if ratio else ["-", "-"]
+            cells += [f"{entropy[name]:.2f}" if entropy else "-" for name in ("mean", "std")]
+            of = objects if one == objects else f"{objects}: {one}"
+            rows.append((found["hand"], of, f"{found['rows']:,}", *cells))
     return TextTable(columns, rows, right=columns[2:])
 
 

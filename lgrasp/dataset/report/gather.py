@@ -163,7 +163,9 @@ class HandRows:
         self.held: dict[int, HeldRows] = {}
         """By the number of objects in the hand."""
         self.sample = EvenSample(_SAMPLE_ROWS)
-        """q [K], position of the (first) object's middle in the hand's frame [3], place of its group in ``objects``."""
+        """q [K], place of its group in ``objects``."""
+        self.middles = EvenSample(_SAMPLE_ROWS)
+        """Of objects in rows: position of its middle in the hand's frame [3], place of its name in ``names``."""
         self._device = device
 
     def add(self, reader: ShardReader, labels: list[str], advanced: Callable[[int], None]) -> None:
@@ -189,6 +191,11 @@ class HandRows:
                 held = [(slot, labels[k], records[k]) for slot, k in enumerate(index) if k >= 0]
                 self._add_rows(rows, chosen, held, strict)
             advanced(start + len(rows))
+
+    @property
+    def names(self) -> list[str]:
+        """Of all objects."""
+        return list(dict.fromkeys(name for group in self.objects for name in group))
 
     def together(self) -> dict[str, Distribution]:
         """Distributions over all objects."""
@@ -234,12 +241,12 @@ class HandRows:
         group.contacts.update((rows.contact_links[chosen] >= 0).sum((1, 2)).tolist())
         q, pose = rows.q[chosen], rows.object_pose[chosen]
         group.near.add(pose[:, slots], q)
-        middles = []
         for o, name, record in held:
             vertices = np.asarray(record.vertices, float)
             middle = (vertices.min(0) + vertices.max(0)) / 2
             T = pose_matrix(pose[:, o].astype(float))
-            middles.append(group.coverage.setdefault(name, Coverage()).add(T, middle))
+            position = group.coverage.setdefault(name, Coverage()).add(T, middle).astype(np.float32)
+            self.middles.add({"position": position, "name": np.full(len(chosen), self.names.index(name))})
             group.spread.setdefault(name, GraspSpread(self.hand, self.locked)).add(T, q.astype(float))
             if name not in group.touched:
                 group.touched[name] = TouchedSurface(record)
@@ -247,4 +254,4 @@ class HandRows:
             group.touched[name].add(*(values.reshape(-1, 3) for values in contacts))
         add_verdicts(group.verdicts, rows, chosen)
         place = np.full(len(chosen), list(self.objects).index(names))
-        self.sample.add({"q": q, "position": middles[0].astype(np.float32), "group": place})
+        self.sample.add({"q": q, "group": place})

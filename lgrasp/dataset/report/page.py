@@ -138,10 +138,12 @@ def _physics(data: dict[str, Any]) -> list[Block]:
 
 def _dots(data: dict[str, Any], hand: HandRows) -> list[Block]:
     """Where objects are, from where hands come, and the postures: charts of the sampled rows."""
-    sample, every, names = hand.sample.columns(), data["sample"]["every"], [" + ".join(names) for names in hand.objects]
-    dots = f"Dots: {number(data['sample']['rows'])} of {number(data['rows'])} grasps"
-    dots += f", one in {every}." if every > 1 else "."
-    where = f"Middle of the object's bounding box in the frame of the hand's base (+: its origin). {dots}"
+    sample, middles, names = hand.sample.columns(), hand.middles.columns(), [" + ".join(n) for n in hand.objects]
+    dots = _sampled(data["sample"]["rows"], data["sample"]["every"], data["rows"], "grasps")
+    held = sum(group.rows * len(group.coverage) for group in hand.objects.values())
+    where = "Middle of the object's bounding box in the frame of the hand's base (+: its origin). " + _sampled(
+        len(middles["name"]), hand.middles.step, held, "grasps" if held == data["rows"] else "objects in grasps"
+    )
     maps = hand.directions()
     ways = (
         "Direction from the object's middle to the origin of the hand's base, in the object's frame: where the hand "
@@ -157,8 +159,13 @@ def _dots(data: dict[str, Any], hand: HandRows) -> list[Block]:
         f"{found['components_for_95_percent']} components explain 95 %. {dots}"
     )
     return [
-        *(chapter("Object positions"), _figure(position_chart(sample["position"], sample["group"], names), where)),
+        chapter("Object positions"),
+        _figure(position_chart(middles["position"], middles["name"], hand.names), where),
         *(chapter("Approach directions"), _figure(direction_maps(maps), ways)),
         chapter("Postures"),
         _figure(posture_chart(posture, posture.scores(sample["q"]), sample["group"], names), postures),
     ]
+
+
+def _sampled(shown: int, every: int, rows: int, what: str) -> str:
+    return f"Dots: {number(shown)} of {number(rows)} {what}" + (f", one in {every}." if every > 1 else ".")

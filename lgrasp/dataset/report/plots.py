@@ -126,8 +126,8 @@ def posture_chart(posture: Posture, scores: np.ndarray, group: np.ndarray, names
 
 
 def position_chart(position: np.ndarray, group: np.ndarray, names: list[str]) -> str:
-    """The object's middle in the frame of the hand's base, seen along each axis: sampled rows [m], shape [n, 3], of
-    which ``group`` [n] says the place in the names of the objects."""
+    """Middles of objects in the frame of the hand's base, seen along each axis: a sample [m], shape [n, 3], of which
+    ``group`` [n] says the place in the names of the objects."""
     with _figure(10, 3.7) as (figure, svg):
         for axes, (i, j) in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
             _scatter(axes, 1000 * position[:, i], 1000 * position[:, j], group, names)

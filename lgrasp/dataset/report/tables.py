@@ -99,21 +99,25 @@ def _metrics(of: dict[str, Any], shown: list[tuple[str, str, str]]) -> list[str]
 
 
 def diversity_table(data: dict[str, Any]) -> Block:
-    """Poses, near-duplicates and coverage, a row per object (or set of objects held at once)."""
+    """Poses, near-duplicates and coverage, a row per object; of a set held at once a row for each of its objects."""
     columns = ["object", "rows", "poses", "near-dup.", "contacts", "approach", "if uniform", "rotation", "if uniform"]
     columns += ["surface", "PCA 1", "PCA 5", "entropy", "std"]
     rows = []
     for group in data["objects"]:
         near = group["near_duplicates"]
         contacts = sum(int(n) * rows for n, rows in group["contacts"].items()) / max(group["rows"], 1)
-        cells = [" + ".join(group["objects"]), number(group["rows"]), number(group["distinct_poses"])]
+        cells = [number(group["rows"]), number(group["distinct_poses"])]
         cells += [f"{'!' * (near['share'] > _NEAR_SHARE)}{near['share']:.2%}", f"{contacts:.2f}"]
-        first = next(iter(group["coverage"].values()), None)
-        for what in ("directions", "rotations"):
-            cells += [f"{first[what][share]:.0%}" if first else "-" for share in ("share", "share_if_uniform")]
-        cells.append(f"{first['surface']['share']:.0%}" if first else "-")
-        rows.append([*cells, *_spread(next(iter(group["diversity"].values()), None))])
-    if len(rows) > 1:
+        name = " + ".join(group["objects"])
+        for k, (one, cover) in enumerate(group["coverage"].items()):
+            hit = [
+                f"{cover[what][share]:.0%}"
+                for what in ("directions", "rotations")
+                for share in ("share", "share_if_uniform")
+            ]
+            told = [name if one == name else f"{name}: {one}", *(cells if k == 0 else [""] * len(cells))]
+            rows.append([*told, *hit, f"{cover['surface']['share']:.0%}", *_spread(group["diversity"].get(one))])
+    if len(data["objects"]) > 1:
         rows.append(["all", number(data["rows"]), *[""] * 8, *_spread(data["diversity"])])
     caption = (
         "Poses: distinct object poses. Near-dup.: object within 5 mm and 5 deg and every joint within 0.1 rad of a row "
@@ -123,7 +127,7 @@ def diversity_table(data: dict[str, Any]) -> Block:
         "principal components explain (DexGraspBench; less is more diverse). Entropy of the joints, mean and std "
         "(DexGraspNet)."
     )
-    return table(columns, rows, caption=caption, total=len(rows) > 1)
+    return table(columns, rows, caption=caption, total=len(data["objects"]) > 1)
 
 
 def _spread(found: dict[str, Any] | None) -> list[str]:

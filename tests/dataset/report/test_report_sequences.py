@@ -74,6 +74,16 @@ def test_page_has_the_tables(reported):
     assert "cup + mug é" in text or "mug é + cup" in text
 
 
+def test_every_object_of_a_set_has_its_line(reported):
+    numbers, text, _ = reported
+    section = text[text.index("<h3>Diversity</h3>") :]
+    for group in numbers["hands"][0]["objects"]:
+        if len(group["objects"]) > 1:
+            for name, cover in group["coverage"].items():
+                line = section[section.index(f"{' + '.join(group['objects'])}: {name}</td>") :]
+                assert f"{cover['surface']['share']:.0%}" in line[: line.index("</tr>")]
+
+
 def test_command_says_how_many_objects(reported):
     (line,) = (line for line in reported[2].splitlines() if line.startswith("objects in the hand"))
     assert line.split(maxsplit=4)[4] == "1: 60, 2: 50, 3: 24"
