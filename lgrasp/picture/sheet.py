@@ -18,6 +18,7 @@ FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP", ".gif": "GIF"}
 """Of image files, by suffix."""
 
 _INK = "#3c4650"
+_SMALL = 0.75  # least size of captions, of what it is where there is room
 
 
 def sheet(
@@ -39,7 +40,8 @@ def sheet(
     wide, high = min(columns, len(pictures)) * w, -(-len(pictures) // columns) * tall
     line = max(11, wide // 56) if key else 0
     out = Image.new("RGB", (wide, high + 2 * line), "#ffffff")
-    draw, font = ImageDraw.Draw(out), ImageFont.load_default(size)
+    draw = ImageDraw.Draw(out)
+    captions, font = _fitting(captions, size, w - size, draw)
     for i, picture in enumerate(pictures):
         x, y = i % columns * w, i // columns * tall
         out.paste(Image.fromarray(picture), (x, y))
@@ -51,6 +53,19 @@ def sheet(
         draw.text((x + 1.5 * line, high + line), words, _INK, font, anchor="lm")
         x += int(3 * line + draw.textlength(words, font))
     return out
+
+
+def _fitting(
+    captions: Sequence[str], size: float, width: float, draw: ImageDraw.ImageDraw
+) -> tuple[list[str], ImageFont.FreeTypeFont | ImageFont.ImageFont]:
+    """Captions as wide as a picture at most, and their font: smaller first, then without their beginning."""
+    widest = max((draw.textlength(words, ImageFont.load_default(size)) for words in captions), default=0)
+    font, fitting = ImageFont.load_default(size * float(np.clip(width / max(widest, 1), _SMALL, 1))), []
+    for words in captions:
+        while len(words) > 1 and draw.textlength(words, font) > width:
+            words = "…" + words[2:]
+        fitting.append(words)
+    return fitting, font
 
 
 def check_image(path: Path, suffixes: Collection[str] = FORMATS.keys()) -> None:

@@ -66,3 +66,6 @@ def test_sheet():
     assert told.width == 300
     assert told.height > 40
     assert np.asarray(told)[40:, :60].min() < 128, "no caption"
+    long = np.asarray(sheet(tiles, ["a hand with a long name · row 1"] * 5, columns=5))[40:]
+    assert long[:, 5:55].min() < 128
+    assert (long[:, 58:62] == WHITE).all(), "captions touch each other"

@@ -15,6 +15,7 @@ from lgrasp.dataset.report.quantity import Distribution
 MAPS = 12
 
 _LAYOUT = "constrained"
+_LAST_LABEL = 0.985  # share of the width that axes take: half of an axis' last label is beyond
 _INK = "#010203"  # of charts.mplstyle; replaced by currentColor
 _BAR = "#2f86c9"
 _BOUND = "#d55e00"
@@ -39,6 +40,9 @@ def _figure(width: float, height: float) -> Iterator[tuple[Any, Callable[[], str
 
     with matplotlib.rc_context(fname=str(Path(__file__).with_name("charts.mplstyle"))):
         figure = Figure(figsize=(width, height), layout=_LAYOUT)
+        layout: Any = figure.get_layout_engine()
+        if layout:
+            layout.set(rect=(0, 0, _LAST_LABEL, 1))
         yield figure, svg
 
 
