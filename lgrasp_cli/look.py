@@ -113,7 +113,7 @@ def view_hand(name: HandArgument, host: Host = "localhost", port: Port = 8080, c
 
 
 def _tell_address(site: "Site") -> None:
-    echo(f"open http://{site.front.host}:{site.front.port} in a browser; Ctrl-C ends this")
+    echo(f"open {site.front.url} in a browser; Ctrl-C ends this")
 
 
 def _numbers(text: str) -> list[int]:

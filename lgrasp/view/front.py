@@ -6,6 +6,7 @@ send comes through here; a connection is one request or one web socket.
 
 import asyncio
 import re
+import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -46,6 +47,12 @@ class Front:
         self._thread = threading.Thread(target=asyncio.run, args=(self._run(listening),), daemon=True)
         self._thread.start()  # which has a loop of its own: that of a notebook runs already
         self.port = listening.result()
+
+    @property
+    def url(self) -> str:
+        """What to open, of this computer's name if all of its addresses are listened on."""
+        host = socket.gethostname() if self.host in {"0.0.0.0", "::"} else self.host
+        return f"http://{host}:{self.port}"
 
     def close(self) -> None:
         """End all connections."""

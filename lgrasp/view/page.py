@@ -35,6 +35,11 @@ class Aim:
         """On the screen, unit."""
         self.down: np.ndarray = R[:, 1]
 
+    def spans(self, meshes: Sequence[trimesh.Trimesh]) -> np.ndarray:
+        """How far meshes go to the right and down on the screen [m], shape (2,)."""
+        points = np.concatenate([mesh.vertices for mesh in meshes])
+        return np.ptp(points @ np.stack([self.right, self.down], 1), axis=0)
+
     def apply(self, server: "viser.ViserServer", shift: np.ndarray, factor: float = 1.0) -> None:
         """Move all cameras; ``shift`` [m] is added to what is looked at, ``factor`` times as far away as needed."""
         clients = server.get_clients().values()

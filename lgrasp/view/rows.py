@@ -18,8 +18,10 @@ from lgrasp.view.server import View
 if TYPE_CHECKING:
     import viser
 
+    from lgrasp.picture.scene import GraspScene
+
 _MOST = 9  # side by side
-_APART = 0.3  # [m]
+_APART = 1.1  # times what a row takes on the screen
 _SPEED = 0.8  # stages a second
 _PAUSE = 1.0  # stages, at the end
 _AS_STORED = "as stored"
@@ -52,7 +54,8 @@ class RowsView(View):
         self._clock: float | None = None
         rows.place(row)
         first = rows.scene(row)
-        links = list(first.hand.placed(first.at(first.duration - 1)[0]).values())
+        links = _links(first)
+        self._apart = np.zeros(2)  # [m] right and down
         self._aim = Aim(links, [placed.placed for placed in first.objects], first.contacts.points)
         gui = server.gui
         self._at = gui.add_slider("grasp", 0, max(len(rows) - 1, 1), 1, row)
@@ -163,20 +166,21 @@ class RowsView(View):
             ShardError: a shard is damaged.
         """
         with self._lock, self._server.atomic():
-            first = min(position, len(self.order) - 1)
-            chosen = [int(row) for row in self.order[first : first + side]]
+            first = int(np.clip(position, 0, len(self.order) - 1))
+            chosen = [int(row) for row in self.order[first : first + max(side, 1)]]
             scenes = [self._rows.scene(row) for row in chosen]
             while len(self._figures) > len(chosen):
                 self._server.scene.remove_by_name(self._figures.pop().name)
             while len(self._figures) < len(chosen):
                 self._figures.append(GraspFigure(self._server.scene, f"/grasp{len(self._figures)}"))
             columns = int(np.ceil(np.sqrt(len(chosen))))
-            right, down = _APART * self._aim.right, _APART * self._aim.down
+            nearer, self._apart = self._apart, np.max([self._apart, *self._spans(scenes)], axis=0)
+            right, down = self._apart[0] * self._aim.right, self._apart[1] * self._aim.down
             places = [i % columns * right + i // columns * down for i in range(len(chosen))]
             for figure, scene, place in zip(self._figures, scenes, places, strict=True):
                 figure.show(scene)
                 figure.frame.position = place
-            if len(chosen) != len(self.shown):
+            if len(chosen) != len(self.shown) or (len(chosen) > 1 and (nearer != self._apart).any()):
                 self._aim.apply(self._server, (places[0] + places[-1]) / 2, columns * (1 if columns == 1 else 1.2))
             duration = max(scene.duration for scene in scenes)
             if duration != self._time.max:
@@ -211,7 +215,17 @@ class RowsView(View):
             raise ConfigError(f"{error}; still shown: {self._met or 'all rows'}") from None
 
     def _show(self) -> None:
+        for slider in (self._at, self._side):  # what is typed may be outside
+            inside = int(np.clip(slider.value, slider.min, slider.max))
+            if slider.value != inside:
+                slider.value = inside
         self.show(int(self._at.value), int(self._side.value))
+
+    def _spans(self, scenes: Sequence["GraspScene"]) -> list[np.ndarray]:
+        """What each of several rows takes on the screen [m], with some room: right and down."""
+        if len(scenes) == 1:
+            return []
+        return [_APART * self._aim.spans([*_links(s), *(placed.placed for placed in s.objects)]) for s in scenes]
 
     def _mark(self) -> None:
         marks = Marks(*(box.value for box in self._marks))
@@ -228,3 +242,8 @@ class RowsView(View):
             told = f"{value:.4g}" if isinstance(value, float) else str(value)
             lines.append(f"| {name.partition('/')[2]} | {told} |")
         return "\n".join([*lines, "", f"{row_link(chosen[0])}, `lgrasp view {self._told} --row {chosen[0]}`"])
+
+
+def _links(scene: "GraspScene") -> list[trimesh.Trimesh]:
+    """Of the hand at the last grasp."""
+    return list(scene.hand.placed(scene.at(scene.duration - 1)[0]).values())

@@ -93,7 +93,7 @@ class TableView(View):
 
     def _show(self) -> None:
         assert self._figure is not None
-        grasps, row = self._scene.grasps, int(self._rows[min(int(self._at.value), len(self._rows) - 1)])
+        grasps, row = self._scene.grasps, int(self._rows[int(np.clip(self._at.value, 0, len(self._rows) - 1))])
         stages = {name: getattr(grasps, column)[row] for name, column in STAGES.items()}
         nothing = ContactMarks(*(np.zeros((0, 3)) for _ in range(3)), np.zeros(0, int))
         with self._server.atomic():

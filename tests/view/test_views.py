@@ -1,5 +1,6 @@
 """What the viewer shows, by what it holds; no browser."""
 
+import socket
 import sys
 from dataclasses import replace
 from http.client import HTTPConnection
@@ -18,6 +19,7 @@ from lgrasp.picture.camera import Intrinsics
 from lgrasp.picture.scene import STAGES, HandShape, scene_of_row
 from lgrasp.scenes.files import write_scene
 from lgrasp.scenes.records import CloudRecord, SceneGrasps, SceneRecord, ViewsRecord
+from lgrasp.view.front import Front
 
 SHARD = TINY_SHARD
 
@@ -106,6 +108,17 @@ def test_rows_side_by_side_do_not_touch(rows):
     assert names == {"grasp0", "grasp1", "grasp2", "grasp3"}
     rows.choose(where="", side=1)
     assert {name.split("/")[1] for name in rows.meshes().geometry} == {"grasp0"}
+
+
+def test_a_row_before_the_first_is_the_first(rows):
+    rows.show(-3)
+    assert list(rows.shown) == [0]
+
+
+def test_the_address_can_be_opened_elsewhere():
+    front = Front("0.0.0.0", 0, 1)
+    assert front.url == f"http://{socket.gethostname()}:{front.port}"
+    front.close()
 
 
 def test_time_moves_the_hand(rows):
