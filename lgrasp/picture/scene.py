@@ -128,6 +128,8 @@ class GraspScene:
     contacts: ContactMarks
     """With all objects, at the grasp."""
     steps: tuple[Step, ...]
+    table: np.ndarray | None = None
+    """``T_base_table`` of the plane that the object rests on, z up, below its middle, shape (4, 4)."""
 
     @property
     def duration(self) -> float:
@@ -173,7 +175,20 @@ def scene_of_row(hand: HandShape, objects: Sequence[ObjectRecord], rows: GraspRo
     numbers = [poses, points, normals, *(q for step in steps for q in step.stages.values())]
     if not all(np.isfinite(values).all() for values in numbers):
         raise ShardError("poses, contacts or joints are not finite")
-    return GraspScene(hand, tuple(placed), ContactMarks(points + poses[of, :3, 3], normals, forces, of), steps)
+    contacts = ContactMarks(points + poses[of, :3, 3], normals, forces, of)
+    return GraspScene(hand, tuple(placed), contacts, steps, _table(placed, rows, row))
+
+
+def _table(placed: Sequence[PlacedObject], rows: GraspRows, row: int) -> np.ndarray | None:
+    tables = placed[0].record.tables if placed else None
+    which = rows.table["pose"][row] if "pose" in rows.table else -1
+    if tables is None or not 0 <= which < len(tables):
+        return None
+    *up, height, _ = np.asarray(tables[which], float)
+    middle = placed[0].mesh.bounds.mean(0)
+    T = trimesh.geometry.align_vectors([0, 0, 1], up)
+    T[:3, 3] = middle + (height - middle @ up) * np.asarray(up)
+    return placed[0].pose @ T
 
 
 def split_edges(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

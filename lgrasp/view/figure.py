@@ -22,6 +22,8 @@ _NORMAL = 0.02  # [m]
 _THIN = 0.001  # [m]
 _FORCE = 0.08  # [m] of the sum of the normal forces
 _CONE = 0.018  # [m]
+TABLE = "#d8d8d8"
+_TABLE = 0.2, 0.2, 0.001  # [m]
 
 
 class Marks(NamedTuple):
@@ -94,6 +96,7 @@ class GraspFigure:
         self.frame = scene.add_frame(name, show_axes=False)
         self._hand: HandFigure | None = None
         self._objects: list[tuple[ObjectRecord, viser.MeshHandle]] = []
+        self._table: viser.MeshHandle | None = None
         self._marks: list[tuple[int, viser.SceneNodeHandle]] = []  # with the object that is touched
         self.shown: GraspScene | None = None
         self._time = 0.0
@@ -115,6 +118,12 @@ class GraspFigure:
             self._objects.append((placed.record, node))
         for _, node in before[len(grasp.objects) :]:
             node.remove()
+        if self._table is not None:
+            self._table.remove()
+            self._table = None
+        if grasp.table is not None:
+            self._table = add_mesh(self._scene, f"{self.name}/table", _table(), TABLE, opacity=0.25)
+            place(self._table, grasp.table)
         self.shown = grasp
 
     def move(self, time: float) -> None:
@@ -169,4 +178,11 @@ class GraspFigure:
         found = {name: painted(mesh, HAND[0]) for name, mesh in self.shown.hand.placed(q).items()}
         for i, placed in enumerate(self.shown.objects[:held]):
             found[f"object{i}"] = painted(placed.placed, OBJECTS[i % len(OBJECTS)])
+        if self.shown.table is not None:
+            found["table"] = painted(_table().apply_transform(self.shown.table), TABLE)
         return found
+
+
+def _table() -> trimesh.Trimesh:
+    """A piece of a table, its top at z = 0."""
+    return trimesh.creation.box(_TABLE).apply_translation([0, 0, -_TABLE[2] / 2])

@@ -11,7 +11,7 @@ from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.draw import OBJECTS, rgb
 from lgrasp.picture.scene import STAGES, ContactMarks, GraspScene, HandShape, PlacedObject, Step
 from lgrasp.scenes.records import SceneRecord
-from lgrasp.view.figure import GraspFigure, add_mesh, painted, place, show_all, stage_marks
+from lgrasp.view.figure import TABLE, GraspFigure, add_mesh, painted, place, show_all, stage_marks
 from lgrasp.view.front import row_link
 from lgrasp.view.page import Aim, add_saving
 from lgrasp.view.server import View
@@ -19,7 +19,6 @@ from lgrasp.view.server import View
 if TYPE_CHECKING:
     import viser
 
-_TABLE = "#d8d8d8"
 _THICK = 0.01  # [m]
 _POINT = 0.0015  # [m]
 _AWAY = 2.0  # times as far as the objects need, to see hand and table
@@ -38,8 +37,8 @@ class TableView(View):
             nodes.append(add_mesh(server.scene, f"/object{i}", placed.mesh, OBJECTS[i % len(OBJECTS)]))
             place(nodes[-1], placed.pose)
         self._table = trimesh.creation.box((scene.table, scene.table, _THICK)).apply_translation([0, 0, -_THICK / 2])
-        nodes.append(add_mesh(server.scene, "/table", self._table, _TABLE))
-        colours = np.array([rgb(_TABLE), *(rgb(colour) for colour in OBJECTS)], np.uint8)
+        nodes.append(add_mesh(server.scene, "/table", self._table, TABLE))
+        colours = np.array([rgb(TABLE), *(rgb(colour) for colour in OBJECTS)], np.uint8)
         which = np.where(scene.cloud.labels == 0, 0, 1 + (scene.cloud.labels - 1) % len(OBJECTS))
         dark = (0.7 * colours[which]).astype(np.uint8)
         cloud = server.scene.add_point_cloud(
@@ -82,7 +81,7 @@ class TableView(View):
 
     def meshes(self) -> trimesh.Scene:
         """Objects, table, and the hand."""
-        scene = trimesh.Scene({"table": painted(self._table, _TABLE)})
+        scene = trimesh.Scene({"table": painted(self._table, TABLE)})
         for i, placed in enumerate(self._objects):
             scene.add_geometry(painted(placed.placed, OBJECTS[i % len(OBJECTS)]), f"object{i}", f"object{i}")
         if self._figure is not None:

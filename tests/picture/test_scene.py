@@ -47,6 +47,15 @@ def test_contacts_turn_with_the_object(shard, hand):
     np.testing.assert_allclose(scene.contacts.normals, [[0, 1, 0], [0, -1, 0]], atol=1e-7)
 
 
+def test_the_table_touches_the_object(shard, hand):
+    cube = replace(shard.objects[0], tables=np.array([[0, 0, 1, -EDGE / 2, 1], [0, 1, 0, -EDGE / 2, 0]], "f4"))
+    rows = replace(shard.grasps, table={"pose": np.ones(2, "i4")})
+    table = scene_of_row(hand, [cube], rows, 0).table
+    assert table is not None
+    np.testing.assert_allclose(table[:3, 2:].T, [[0, 1, 0], [0, -EDGE / 2, HEIGHT]], atol=1e-7)
+    assert scene_of_row(hand, shard.objects, shard.grasps, 0).table is None
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
