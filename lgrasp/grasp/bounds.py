@@ -200,6 +200,14 @@ class GraspBounds(Params):
         return {"profile": self.profile, "numbers": self.model_dump(mode="json", exclude={"profile"})}
 
 
+def stages_told(config: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
+    """Parameters of the stages of that name in the pipeline that made a shard, by its ``config``."""
+    pipeline = config.get("pipeline")
+    stages = pipeline.get("stages") if isinstance(pipeline, dict) else None
+    found = [stage.get(name) for stage in stages if isinstance(stage, dict)] if isinstance(stages, list) else []
+    return [params for params in found if isinstance(params, dict)]
+
+
 def stored_bounds(config: Mapping[str, Any], where: object = "shard") -> GraspBounds:
     """The bounds that the rows of a shard passed, by its ``config``; of shards that tell none, the strict ones with the
     friction that their filter had.
@@ -212,9 +220,9 @@ def stored_bounds(config: Mapping[str, Any], where: object = "shard") -> GraspBo
         known = {name: x for name, x in told["numbers"].items() if name in GraspBounds.model_fields}
         profile = told["profile"] if told["profile"] in PROFILES else "strict"
         return parse_model(GraspBounds, {"profile": profile} | known, f"{where}: bounds")
-    for stage in config.get("pipeline", {}).get("stages", ()) if isinstance(config.get("pipeline"), dict) else ():
-        if "friction" in stage.get("filter", {}):
-            return parse_model(GraspBounds, {"friction": stage["filter"]["friction"]}, f"{where}: bounds")
+    for params in stages_told(config, "filter"):
+        if "friction" in params:
+            return parse_model(GraspBounds, {"friction": params["friction"]}, f"{where}: bounds")
     return GraspBounds()
 
 

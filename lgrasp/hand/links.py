@@ -16,19 +16,29 @@ def joints_above(joints: Iterable[Joint], link: str) -> list[Joint]:
     return found
 
 
-def joint_values(joints: Iterable[Joint], values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Positions [rad or m] of all movable joints by name, from those of some, shape [n]: others follow the joint that
-    they mimic, or are 0."""
-    rows = len(next(iter(values.values()), np.zeros(1)))
-    by_name = {joint.name: joint for joint in joints}
+Mimics = Mapping[str, tuple[str, float, float] | None]
+"""By the name of a joint the one that it mimics, multiplier and offset; None: it mimics none."""
+
+
+def mimics_of(joints: Iterable[Joint]) -> Mimics:
+    """Those of all movable joints."""
+    return {joint.name: joint.mimic for joint in joints if joint.movable}
+
+
+def joint_values(mimics: Mimics, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Positions [rad or m] of all joints by name, from those of some, shape [n]: others follow the joint that they
+    mimic, or are 0."""
+    rows, found = len(next(iter(values.values()), np.zeros(1))), dict(values)
 
     def value(name: str) -> np.ndarray:
-        mimic = by_name[name].mimic
-        if name in values:
-            return np.asarray(values[name], float)
-        return np.zeros(rows) if mimic is None else mimic[1] * value(mimic[0]) + mimic[2]
+        if name not in found:
+            mimic = mimics[name]
+            found[name] = np.zeros(rows) if mimic is None else mimic[1] * value(mimic[0]) + mimic[2]
+        return found[name]
 
-    return {name: value(name) for name, joint in by_name.items() if joint.movable}
+    for name in mimics:
+        value(name)
+    return found
 
 
 def link_poses(urdf: Urdf, base_link: str, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -38,8 +48,8 @@ def link_poses(urdf: Urdf, base_link: str, values: Mapping[str, np.ndarray]) -> 
         base_link: link whose frame the poses are given in.
         values: of :func:`joint_values`, of some joints.
     """
-    rows = len(next(iter(values.values()), np.zeros(1)))
-    at = joint_values(urdf.joints, values)
+    at = joint_values(mimics_of(urdf.joints), {name: np.asarray(x, float) for name, x in values.items()})
+    rows = len(next(iter(at.values()), np.zeros(1)))
     poses = {urdf.root: np.tile(np.eye(4), (rows, 1, 1))}
     for joint in urdf.joints:
         T = poses[joint.parent] @ joint.T_parent_joint

@@ -1,7 +1,7 @@
 """Copies of shards with more metrics."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,7 +16,7 @@ from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import OutputError, ShardError
-from lgrasp.grasp.bounds import GraspBounds, stored_bounds
+from lgrasp.grasp.bounds import GraspBounds, stages_told, stored_bounds
 from lgrasp.grasp.rows import METRIC_UNITS
 from lgrasp.hold.params import HoldTest
 from lgrasp.jobs.difference import text_difference
@@ -66,12 +66,11 @@ class MetricsJob(MetricsRequest, ShardJob):
                 continue
             with ShardReader(part.source) as reader:
                 asked = self._measured(*self._numbers_of(reader))
-            for name in sorted(asked.keys() & there.keys()):
-                if how := text_difference(there[name], asked[name]):
-                    raise OutputError(
-                        f"{part.file} has {name} measured with other numbers ({how}); choose another --out, or "
-                        "--overwrite to replace it"
-                    )
+            for name, how in _differences(there, asked):
+                raise OutputError(
+                    f"{part.file} has {name} measured with other numbers ({how}); choose another --out, or "
+                    "--overwrite to replace it"
+                )
             self._copies[part.number] = part.file
             if asked.keys() <= there.keys():
                 present[part.number] = part.rows
@@ -89,9 +88,8 @@ class MetricsJob(MetricsRequest, ShardJob):
         with ShardReader(part.source) as reader:
             (bounds, test), key = self._numbers_of(reader), self.key_of(reader)
             asked, there = self._measured(bounds, test), _measured_by_stage(reader) | measured_with(reader)
-        for name in asked.keys() & there.keys():
-            if how := text_difference(there[name], asked[name]):
-                notice(f"{name} of the shards was measured with other numbers ({how}); the copies have the new values")
+        for name, how in _differences(there, asked):
+            notice(f"{name} of the shards was measured with other numbers ({how}); the copies have the new values")
         told = {name + MEASURED: text for name, text in asked.items()}
         workers, others = threads(self.workers), [name for name in self.add if name != HOLD]
         kinds, columns = (HOLD in self.add) + bool(others), {}
@@ -153,10 +151,15 @@ class MetricsJob(MetricsRequest, ShardJob):
 
 def _measured_by_stage(reader: ShardReader) -> dict[str, str]:
     """The numbers (JSON) with which the pipeline of a shard tried its rows, if it did."""
-    pipeline = reader.header.config.get("pipeline")
-    stages = pipeline.get("stages", ()) if isinstance(pipeline, dict) else ()
-    tried = [stage[HOLD] for stage in stages if HOLD in stage]
+    tried = stages_told(reader.header.config, HOLD)
     return {HOLD: json.dumps({k: x for k, x in tried[0].items() if k != "version"}, sort_keys=True)} if tried else {}
+
+
+def _differences(there: Mapping[str, str], asked: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """What was measured and is asked with other numbers (JSON), and which."""
+    for name in sorted(asked.keys() & there.keys()):
+        if how := text_difference(there[name], asked[name]):
+            yield name, how
 
 
 def _sets(paths: Sequence[Path]) -> list[dict[str, Any]]:

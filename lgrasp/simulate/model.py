@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError, short_reason
-from lgrasp.hand.links import joint_values, joints_above
+from lgrasp.hand.links import joint_values, joints_above, mimics_of
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.assemble import OBJECT, TABLE, assemble
 from lgrasp.simulate.protocol import Protocol
@@ -91,7 +91,7 @@ def build_model(scene: Scene, protocol: Protocol, q: np.ndarray, objects: Sequen
     still = {joint.name for joint in joints_above(joints, hand.base_link)}
     while more := {joint.name for joint in joints if joint.mimic and joint.mimic[0] in still} - still:
         still |= more
-    values = joint_values(joints, {name: q[k : k + 1] for name, k in column.items()})
+    values = joint_values(mimics_of(joints), {name: q[k : k + 1].astype(float) for name, k in column.items()})
     held = tuple((name, float(value[0])) for name, value in values.items() if name in still)
     return _build(scene, protocol.model_dump_json(), held, tuple(objects))
 

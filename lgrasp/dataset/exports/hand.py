@@ -13,6 +13,7 @@ from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import compose, inverse, pose_from_matrix
 from lgrasp.geometry.quiet import quiet_parsers
 from lgrasp.grasp.records import HandRecord
+from lgrasp.hand.links import joint_values
 from lgrasp.hand.urdf import parse_robot
 
 _LOG = "yourdfpy.urdf"  # which complains of joints that mimic one that mimics another
@@ -126,17 +127,7 @@ class HandFrames:
 
     def all_joints(self, q: np.ndarray) -> dict[str, np.ndarray]:
         """Positions [rad or m] of every movable joint by name, those that mimic others too; each shape [n]."""
-        values = {name: q[:, i] for i, name in enumerate(self.joint_names)}
-
-        def value(name: str) -> np.ndarray:
-            if name not in values:
-                source, multiplier, offset = self.mimics[name]
-                values[name] = multiplier * value(source) + offset
-            return values[name]
-
-        for name in self.mimics:
-            value(name)
-        return values
+        return joint_values(self.mimics, {name: q[:, i] for i, name in enumerate(self.joint_names)})
 
     def _between(self) -> set[str]:
         """Joints that decide where the base link is, those that such a joint mimics included."""
