@@ -37,6 +37,7 @@ from lgrasp.grasp.outcomes import LATE, MEASURED, METRICS, REASONS, SHARED, Outc
 from lgrasp.grasp.pregrasp_kernels import (
     FINGER_TRIES,
     OPENING_SHARES,
+    find_distances_off,
     measure_closing,
     open_fingers,
     open_poses,
@@ -199,14 +200,16 @@ class Check:
         wp.launch(find_stable_squeeze, m, inputs, [packed], device=d)
         wp.launch(limit_squeeze, m, [hand, limits, row], [packed], device=d)
         tried, stuck = wp.zeros(m, dtype=wp.int32, device=d), wp.zeros(1 + m, dtype=wp.int32, device=d)
-        inputs = [hand, obj, self.held.struct, limits, places, at, opened, row]
+        off = wp.empty((m, self.bodies - 1), dtype=wp.float32, device=d)
+        wp.launch(find_distances_off, (self.bodies - 1, m), [hand, obj, limits, places, at, row], [off], device=d)
+        inputs = [hand, obj, self.held.struct, limits, at, opened, row, off]
         wp.launch(try_openings, (OPENING_SHARES, m), inputs, [tried], device=d)
         wp.launch(open_poses, m, [hand, at, opened, row, tried], [packed, stuck], device=d)
         clear = wp.zeros((m, model.groups), dtype=wp.int32, device=d)
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)
         inputs = [hand, self.held.struct, limits, at, opened, row, stuck, clear]
         wp.launch(open_fingers, m, inputs, [packed], device=d)
-        wp.launch(measure_closing, (model.groups, m), [hand, obj, limits, places, at, row], [packed], device=d)
+        wp.launch(measure_closing, (model.groups, m), [hand, obj, at, row, off], [packed], device=d)
         wp.launch(grasp_epsilon, m, [obj, seed, limits, places, at, row], [packed], device=d)
         wp.launch(pack_rows, m, [hand, places, at, found, row], [packed], device=d)
         return packed

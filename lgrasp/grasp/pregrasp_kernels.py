@@ -27,25 +27,39 @@ _NEAR = wp.constant(0.002)  # [m] bodies whose samples are farther from the obje
 
 
 @wp.func
-def _rests(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, T_grasp: wp.transform, margin: wp.float32):
-    """True if a body is nearer to the object than ``margin`` [m] at the grasp already, and at T no deeper in it than
-    there. Both are T_object_body."""
-    if body_apart(hand, obj, body, T_grasp, margin):
-        return False
-    most = body_depth(hand, obj, body, T_grasp, _DEEPEST) + _INSIDE
-    return body_depth(hand, obj, body, T, most) <= most
+def distance_off(hand: Hand, obj: Object, limits: Limits, body: wp.int32, T: wp.transform):
+    """How far a body without a contact must be off the object as the hand opens [m]: where the object rests on it at
+    the grasp it may stay, as deep (below 0) as at a grasp. T = T_object_body at the grasp."""
+    if body_apart(hand, obj, body, T, limits.min_pregrasp_distance):
+        return limits.min_pregrasp_distance
+    return -limits.max_penetration
 
 
-@wp.func
-def _touching_bodies(hand: Hand, places: Places, at: CheckedPostures, s: wp.int32, g: wp.int32):
-    """Bit k: body k of group g has a contact in hand s."""
-    bits = int(0)
+@wp.kernel
+def find_distances_off(
+    hand: Hand,
+    obj: Object,
+    limits: Limits,
+    places: Places,
+    at: CheckedPostures,
+    row: wp.array(dtype=wp.int32),
+    off_out: wp.array2d(dtype=wp.float32),
+):
+    """How far each body must be off the object as the hand opens (:func:`distance_off`), one thread per (body, row).
+
+    Args:
+        row: (m,) hand of each row, -1 none.
+        off_out: (m, bodies - 1) of all but the base [m].
+    """
+    j, i = wp.tid()
+    s = row[i]
+    if s < 0:
+        return
+    off_out[i, j] = limits.min_pregrasp_distance
     for c in range(at.contact.shape[1]):
-        if at.contact[s, c] >= 0:
-            b = places.body[at.contact[s, c]]
-            if b > 0 and hand.body_group[b] == g:
-                bits = bits | (1 << (b - 1 - hand.kin.joint_first[g]))
-    return bits
+        if at.contact[s, c] >= 0 and places.body[at.contact[s, c]] == 1 + j:
+            return
+    off_out[i, j] = distance_off(hand, obj, limits, 1 + j, wp.transform_inverse(at.pose[at.of[s]]) * at.body[s, j])
 
 
 @wp.func
@@ -59,25 +73,20 @@ def finger_clear(
     T: wp.transform,
     pose: wp.int32,
     X: wp.array(dtype=wp.transform),
-    X_grasp: wp.array(dtype=wp.transform),
-    touching: wp.int32,
+    off: wp.array(dtype=wp.float32),
 ):
-    """1 if the bodies of a finger are off the object at T, its table and what is held. Bodies without a contact on
-    which the object rests at the grasp may stay there.
+    """1 if the bodies of a finger are off the object at T, its table and what is held.
 
     Args:
-        X: (bodies - 1,) X[j] = pose of body 1 + j. X_grasp: the same at the grasp.
-        touching: bit k: body k of the finger has a contact.
+        X: (bodies - 1,) X[j] = pose of body 1 + j.
+        off: (bodies - 1,) how far each must be off the object [m].
     """
     T_object = wp.transform_inverse(T)
     plane = resting_plane(obj, T, pose)
     above = limits.min_table_distance
-    margin = limits.min_pregrasp_distance
     for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-        if not body_apart(hand, obj, 1 + k, T_object * X[k], margin):
-            contact = (touching >> (k - hand.kin.joint_first[g])) & 1
-            if contact == 1 or not _rests(hand, obj, 1 + k, T_object * X[k], T_object * X_grasp[k], margin):
-                return 0
+        if not body_apart(hand, obj, 1 + k, T_object * X[k], off[k]):
+            return 0
         if body_height(hand.pieces, 1 + k, X[k], plane, above) < above:
             return 0
         if not body_clear_of_held(hand, held, h, 1 + k, X[k], limits.min_self_distance):
@@ -115,10 +124,10 @@ def try_openings(
     obj: Object,
     held: Held,
     limits: Limits,
-    places: Places,
     at: CheckedPostures,
     opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
+    off: wp.array2d(dtype=wp.float32),
     clear_out: wp.array(dtype=wp.int32),
 ):
     """One thread per (try, row): are the touching fingers, that far open, apart from the objects and the rest of the
@@ -127,6 +136,7 @@ def try_openings(
     Args:
         opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
         row: (m,) hand of each row, -1 none.
+        off: (m, bodies - 1) of :func:`find_distances_off` [m].
         clear_out: (m,) bit t: try t is; of zeros.
     """
     t, i = wp.tid()
@@ -140,10 +150,8 @@ def try_openings(
         x = _opened_share(at.posture[s, g], opened[i, g, 0], t)
         group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
         if at.chosen[s, g] >= 0:
-            touching = _touching_bodies(hand, places, at, s, g)
-            pose = at.pose[at.of[s]]
-            resting = at.resting[at.of[s]]
-            if finger_clear(hand, obj, held, limits, h, g, pose, resting, X, at.body[s], touching) == 0:
+            r = at.of[s]
+            if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, off[i]) == 0:
                 return
     for b in range(G):
         for a in range(b + 2):
@@ -228,10 +236,10 @@ def try_fingers(
     obj: Object,
     held: Held,
     limits: Limits,
-    places: Places,
     at: CheckedPostures,
     opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
+    off: wp.array2d(dtype=wp.float32),
     stuck: wp.array(dtype=wp.int32),
     clear_out: wp.array2d(dtype=wp.int32),
 ):
@@ -240,6 +248,7 @@ def try_fingers(
     Args:
         opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
         row: (m,) hand of each row, -1 none.
+        off: (m, bodies - 1) of :func:`find_distances_off` [m].
         stuck: (1 + m,) how many rows are listed, and these.
         clear_out: (m, G) bit t: try t is; of zeros.
     """
@@ -255,8 +264,7 @@ def try_fingers(
     x = opened_finger(hand, held, h, g, t, at.posture[s, g], opened[i, g, 0], opened[i, g, 1])
     group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
     r = at.of[s]
-    touching = _touching_bodies(hand, places, at, s, g)
-    if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, at.body[s], touching) == 1:
+    if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, off[i]) == 1:
         wp.atomic_or(clear_out, k, g, 1 << t)
 
 
@@ -317,10 +325,9 @@ def open_fingers(
 def measure_closing(
     hand: Hand,
     obj: Object,
-    limits: Limits,
-    places: Places,
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
+    off: wp.array2d(dtype=wp.float32),
     packed_out: Packed,
 ):
     """Deepest penetration [m] of fingers and object two thirds of the straight way from ``q_pregrasp`` to ``q``, and
@@ -331,6 +338,7 @@ def measure_closing(
 
     Args:
         row: (m,) hand of each row, -1 none.
+        off: (m, bodies - 1) of :func:`find_distances_off` [m].
     """
     g, i = wp.tid()
     s = row[i]
@@ -348,7 +356,6 @@ def measure_closing(
     inside = wp.zeros(shape=(MAX_BODIES,), dtype=wp.int32)
     swept = wp.zeros(shape=(MAX_BODIES,), dtype=wp.float32)
     T_object = wp.transform_inverse(at.pose[at.of[s]])
-    touching = _touching_bodies(hand, places, at, s, g)
     deepest = float(0.0)
     farthest = float(0.0)
     for part in range(1, _PARTS + 1):
@@ -362,12 +369,9 @@ def measure_closing(
             before[j] = X[j]
             inside[j] = 0
             T = T_object * X[j]
-            if part < _PARTS and not body_apart(hand, obj, 1 + j, T, _NEAR):
+            if part < _PARTS and not body_apart(hand, obj, 1 + j, T, wp.where(off[i, j] < 0.0, off[i, j], _NEAR)):
                 last = part == _PARTS - 1
                 depth = body_depth(hand, obj, 1 + j, T, wp.where(last, _DEEPEST, _INSIDE))
-                free = depth > 0.0 and (touching >> (j - hand.kin.joint_first[g])) & 1 == 0
-                if free and _rests(hand, obj, 1 + j, T, T_object * at.body[s, j], limits.min_pregrasp_distance):
-                    depth = float(0.0)
                 if last:
                     deepest = wp.max(deepest, depth)
                 if depth > _INSIDE:

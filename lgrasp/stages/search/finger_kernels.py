@@ -7,7 +7,7 @@ from lgrasp.grasp.check_structs import Limits
 from lgrasp.grasp.collision import body_depth_slice
 from lgrasp.grasp.control_kernels import back_off, shift_contact
 from lgrasp.grasp.held import Held
-from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, finger_clear, joint_motion, opened_finger
+from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, distance_off, finger_clear, joint_motion, opened_finger
 from lgrasp.grasp.structs import FURTHER, Candidates, further_contacts
 from lgrasp.hand.arrays import Hand
 from lgrasp.hand.self_collision import group_pairs_clear
@@ -184,13 +184,18 @@ def _opens(
     freed = q
     if n > 1:
         freed = back_off(hand, g, q, n, body, points, normals, limits.pregrasp_distance)
+    off = wp.zeros(shape=(MAX_BODIES,), dtype=wp.float32)
+    for k in range(first, hand.kin.joint_first[g + 1]):
+        off[k] = limits.min_pregrasp_distance
+        if (touching >> (k - first)) & 1 == 0:
+            off[k] = distance_off(hand, obj, limits, 1 + k, wp.transform_inverse(pose) * X_grasp[k])
     for t in range(FINGER_TRIES):
         x = opened_finger(hand, held, h, g, t, q, opened, freed)
         moved = joint_motion(hand, g, x, q)
         if moved >= limits.min_pregrasp_opening:
             group_forward(hand.kin, g, x, X, first)
             resting = candidates.poses.resting[row]
-            if finger_clear(hand, obj, held, limits, h, g, pose, resting, X, X_grasp, touching) == 1:
+            if finger_clear(hand, obj, held, limits, h, g, pose, resting, X, off) == 1:
                 return moved <= limits.max_closing_travel
     return False
 
