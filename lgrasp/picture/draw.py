@@ -12,7 +12,7 @@ from lgrasp.hand.surface import joined_mesh
 from lgrasp.picture import shade_kernels as kernels
 from lgrasp.picture.camera import Intrinsics, central_camera, look_at
 from lgrasp.picture.depth import LabelledMesh, join_surfaces, render
-from lgrasp.picture.scene import GraspScene, balls, split_edges
+from lgrasp.picture.scene import GraspScene, balls, split_edges, table_piece
 from lgrasp.runtime.device import start
 from lgrasp.runtime.fetch import to_numpy
 
@@ -20,6 +20,7 @@ HAND = ("#a9b6c6", "#8796a8")
 """Colours of links, in turns."""
 OBJECTS = ("#f2a33c", "#4fa79a", "#c66fb4", "#86b04a", "#d9695c", "#5f86d9")
 CONTACT = "#b3001b"
+TABLE = "#d8d8d8"
 
 ANGLE = 22.0
 """Field of view [deg]."""
@@ -51,7 +52,8 @@ class Viewpoint(NamedTuple):
 
 
 def draw_scene(scene: GraspScene, size: int, times: Sequence[float], colour: int) -> Iterator[np.ndarray]:
-    """The last step of a row at some times, by one camera, contacts as dots; sRGB, each (size, size, 3), uint8.
+    """The last step of a row at some times, by one camera, contacts as dots; sRGB, each (size, size, 3), uint8. A
+    table is level.
 
     Args:
         times: rising; 0 pregrasp, 1 grasp, 2 squeeze.
@@ -59,14 +61,21 @@ def draw_scene(scene: GraspScene, size: int, times: Sequence[float], colour: int
     """
     stages = list(scene.steps[-1].stages.values())
     first, last = int(times[0]), int(np.ceil(times[-1]))
-    links = [mesh for q in stages[first : last + 1] for mesh in scene.hand.placed(q).values()]
-    objects = [placed.placed for placed in scene.objects]
-    view = choose_viewpoint(links, objects, scene.contacts.points, size)
+    upright = np.eye(4) if scene.table is None else np.linalg.inv(scene.table)
+
+    def placed_links(q: np.ndarray) -> list[trimesh.Trimesh]:
+        return [mesh.apply_transform(upright) for mesh in scene.hand.placed(q).values()]
+
+    objects = [placed.placed.apply_transform(upright) for placed in scene.objects]
+    points = trimesh.transform_points(scene.contacts.points, upright)
+    view = choose_viewpoint([m for q in stages[first : last + 1] for m in placed_links(q)], objects, points, size)
     still = [Painted(mesh, OBJECTS[i % len(OBJECTS)]) for i, mesh in enumerate(objects, colour)]
+    if scene.table is not None:
+        still.append(Painted(table_piece(), TABLE))
     for time in times:
         q, _ = scene.at(scene.duration - len(stages) + 1 + time)
-        moving = [Painted(mesh, HAND[i % len(HAND)]) for i, mesh in enumerate(scene.hand.placed(q).values())]
-        yield draw(moving + still, scene.contacts.points, view)
+        moving = [Painted(mesh, HAND[i % len(HAND)]) for i, mesh in enumerate(placed_links(q))]
+        yield draw(moving + still, points, view)
 
 
 def choose_viewpoint(

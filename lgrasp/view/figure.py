@@ -9,8 +9,8 @@ import trimesh
 from lgrasp.geometry.poses import pose_from_matrix
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.hand.surface import joined_mesh
-from lgrasp.picture.draw import CONTACT, HAND, OBJECTS, rgb
-from lgrasp.picture.scene import STAGES, GraspScene, HandShape, balls, split_edges
+from lgrasp.picture.draw import CONTACT, HAND, OBJECTS, TABLE, rgb
+from lgrasp.picture.scene import STAGES, GraspScene, HandShape, balls, split_edges, table_piece
 
 if TYPE_CHECKING:
     import viser
@@ -22,8 +22,6 @@ _NORMAL = 0.02  # [m]
 _THIN = 0.001  # [m]
 _FORCE = 0.08  # [m] of the sum of the normal forces
 _CONE = 0.018  # [m]
-TABLE = "#d8d8d8"
-_TABLE = 0.2, 0.2, 0.001  # [m]
 
 
 class Marks(NamedTuple):
@@ -122,7 +120,7 @@ class GraspFigure:
             self._table.remove()
             self._table = None
         if grasp.table is not None:
-            self._table = add_mesh(self._scene, f"{self.name}/table", _table(), TABLE, opacity=0.25)
+            self._table = add_mesh(self._scene, f"{self.name}/table", table_piece(), TABLE, opacity=0.25)
             place(self._table, grasp.table)
         self.shown = grasp
 
@@ -179,10 +177,5 @@ class GraspFigure:
         for i, placed in enumerate(self.shown.objects[:held]):
             found[f"object{i}"] = painted(placed.placed, OBJECTS[i % len(OBJECTS)])
         if self.shown.table is not None:
-            found["table"] = painted(_table().apply_transform(self.shown.table), TABLE)
+            found["table"] = painted(table_piece().apply_transform(self.shown.table), TABLE)
         return found
-
-
-def _table() -> trimesh.Trimesh:
-    """A piece of a table, its top at z = 0."""
-    return trimesh.creation.box(_TABLE).apply_translation([0, 0, -_TABLE[2] / 2])

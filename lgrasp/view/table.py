@@ -8,10 +8,10 @@ import trimesh
 
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import pose_matrix
-from lgrasp.picture.draw import OBJECTS, rgb
+from lgrasp.picture.draw import OBJECTS, TABLE, rgb
 from lgrasp.picture.scene import STAGES, ContactMarks, GraspScene, HandShape, PlacedObject, Step
 from lgrasp.scenes.records import SceneRecord
-from lgrasp.view.figure import TABLE, GraspFigure, add_mesh, painted, place, show_all, stage_marks
+from lgrasp.view.figure import GraspFigure, add_mesh, painted, place, show_all, stage_marks
 from lgrasp.view.front import row_link
 from lgrasp.view.page import Aim, add_saving
 from lgrasp.view.server import View

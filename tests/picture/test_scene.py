@@ -8,6 +8,7 @@ import trimesh
 from support.jaws import EDGE, HEIGHT, jaw_rows, jaw_shard
 
 from lgrasp.errors import ShardError
+from lgrasp.picture.draw import draw_scene
 from lgrasp.picture.scene import HandShape, scene_of_row
 
 
@@ -72,3 +73,18 @@ def test_rows_that_cannot_be_shown_say_why(shard, hand, change, message):
 def test_a_hand_whose_urdf_lacks_a_joint_is_named(shard):
     with pytest.raises(ShardError, match="no movable joint 'elbow'"):
         HandShape.of_record(replace(shard.hand, joint_names=("l", "elbow")))
+
+
+def test_a_table_is_level_below_the_object(shard, hand):
+    turn = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # its x axis is up
+    scene = scene_of_row(hand, shard.objects, shard.grasps, 0)
+    middle = scene.objects[0].placed.bounds.mean(0)
+    table = turn.copy()
+    table[:3, 3] = middle - EDGE / 2 * turn[:3, 2]
+    size = 64
+    (picture,) = draw_scene(replace(scene, table=table), size, [1], 0)
+    (without,) = draw_scene(scene, size, [1], 0)
+    grey = (np.ptp(picture.astype(int), axis=-1) < 12) & (picture.max(-1) < 250)
+    assert grey[-8:].mean() > 0.5, "no table at the bottom of the picture"
+    assert not grey[:8].any(), "it is not level"
+    assert (without[[0, -1]] == 255).all()
