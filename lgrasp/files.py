@@ -68,7 +68,8 @@ def check_folder(out: Path) -> None:
     """
     nearest = next(p for p in (out, *out.absolute().parents) if os.path.lexists(p))
     if not nearest.is_dir():
-        raise OutputError(f"output folder {out} cannot be made: {nearest} is a file; choose another with --out")
+        what = "leads nowhere" if nearest.is_symlink() and not nearest.exists() else "is a file"
+        raise OutputError(f"output folder {out} cannot be made: {nearest} {what}; choose another with --out")
     try:
         tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:

@@ -28,8 +28,8 @@ def data_dirs(kind: str) -> list[Path]:
         shipped = _PACKAGE.parent / kind
     roots = [Path(p).expanduser() for p in os.environ.get("LGRASP_PATH", "").split(os.pathsep) if p]
     for root in roots:
-        notice("" if root.is_dir() else f"LGRASP_PATH: {root} is no folder")
-    return [p for p in (*(root / kind for root in roots), user_dir(kind), shipped) if p.is_dir()]
+        notice("" if os.path.isdir(root) else f"LGRASP_PATH: {root} is no folder")
+    return [p for p in (*(root / kind for root in roots), user_dir(kind), shipped) if os.path.isdir(p)]
 
 
 def user_dir(kind: str) -> Path:

@@ -58,7 +58,7 @@ def build_field(
         ("size", f"{data['megabytes']:.1f} MB"),
         ("clear of the palm", f"{clear} of postures, by finger"),
         ("time", f"{data['seconds']:.2f} s" + (" (was cached)" if data["cached"] else "")),
-        ("file", data["file"]),
+        ("file", data["file"] or "not kept"),
         *(("note", note) for note in data["notes"]),
     ]
     return Answer(data, [pairs])
@@ -90,7 +90,7 @@ def preprocess(
         ("obstacle points", f"{data['obstacle_points']:,}"),
         ("distance grid", f"{grid} = {data['sdf_cells']:,} cells of {1000 * data['sdf_cell']:.2f} mm"),
         ("time", f"{data['seconds']:.2f} s" + (" (was cached)" if data["cached"] else "")),
-        ("file", data["file"]),
+        ("file", data["file"] or "not kept"),
         *(("repaired", note) for note in data["notes"]),
     ]
     return Answer(data, [pairs])

@@ -12,7 +12,7 @@ from lgrasp.files import remove_leftovers
 
 MOST_PARTS = 100_000
 """Files of a job."""
-_MAX_NAME_LENGTH = 120  # characters of a name; file systems allow 255 bytes
+_MAX_NAME_BYTES = 120  # of a name; file systems allow 255
 
 
 class Found(NamedTuple):
@@ -39,8 +39,8 @@ def run_folder(top: Path, hand: str, name: str, pipeline: str, protocol: str | N
 
 
 def _safe(name: str) -> str:
-    """A name without characters that a file's name had better not have."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", name)[:_MAX_NAME_LENGTH]
+    """A name without characters that a file's name had better not have; letters of any script stay."""
+    return re.sub(r"[^\w.-]+", "_", name).encode()[:_MAX_NAME_BYTES].decode(errors="ignore")
 
 
 def check_number(parts: int, what: str) -> None:

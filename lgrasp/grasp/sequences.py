@@ -9,7 +9,7 @@ from lgrasp.grasp.tables import CONTACTS, GraspTable
 from lgrasp.hand.tree import Tree
 
 _LEAST = ("epsilon", "force_closure", "pregrasp_opening", "squeeze_travel", "squeeze_force", "stable_squeeze")
-"""Metrics of which the smallest of several steps is that of the row; of others it is the largest."""
+"""Metrics of which the smallest of several steps is that of the row; of others but ``room`` it is the largest."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class SequenceTable:
     contact_normals: np.ndarray  # (N, n, C, 3)
     contact_links: np.ndarray  # (N, n, C) i32, -1 padding
     contact_forces: np.ndarray  # (N, n, C, 3)
-    metrics: dict[str, np.ndarray]  # (N,) each: the worst of the steps
+    metrics: dict[str, np.ndarray]  # (N,) each: the worst of the steps; room: of the last
     physics: dict[str, np.ndarray] = field(default_factory=dict)  # (N, ...) each: verdicts of a simulator
 
     def __len__(self) -> int:
@@ -117,6 +117,8 @@ def extend(
     }
     metrics = dict(grasps.metrics)
     for name, values in before.metrics.items():
+        if name == "room":  # of the fingers that are free now
+            continue
         worst = np.fmin if name in _LEAST else np.fmax
         metrics[name] = worst(values[row], metrics[name])
     return SequenceTable(parent=row.astype(np.int64), candidate=grasps.index, metrics=metrics, **longer)

@@ -1,7 +1,9 @@
 """Make and describe the inputs of a job one by one: a contact field, a mesh, a preprocessed object."""
 
+import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,7 +56,7 @@ def prepare_field(
         "seconds": time.perf_counter() - start,
         "cached": load.hits["field"],
         "device": where.name,
-        "file": str(cache.path("field", keys.field)),
+        "file": _kept(cache.path("field", keys.field)),
     }
 
 
@@ -82,8 +84,13 @@ def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: floa
         "sdf_cell": model.sdf_cell,
         "seconds": time.perf_counter() - start,
         "cached": load.hits["object"],
-        "file": str(cache.path("object", key)),
+        "file": _kept(cache.path("object", key)),
     }
+
+
+def _kept(path: Path) -> str | None:
+    """A file of the cache, None if it could not be written."""
+    return str(path) if os.path.exists(path) else None
 
 
 def describe_object(mesh: str, scale: float) -> dict[str, Any]:

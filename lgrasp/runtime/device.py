@@ -47,8 +47,8 @@ def start() -> None:
     if _started:
         return
     wp.config.log_level = wp.LOG_ERROR
-    if "WARP_CACHE_PATH" not in os.environ:
-        wp.config.kernel_cache_dir = str(usable_folder(cache_dir() / "kernels"))
+    wanted = os.environ.get("WARP_CACHE_PATH") or cache_dir() / "kernels"
+    wp.config.kernel_cache_dir = str(usable_folder(Path(wanted)))
     _share_memory()
     with _without_driver_warning():
         wp.init()

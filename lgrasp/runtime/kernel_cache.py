@@ -51,10 +51,14 @@ def _unusable(folder: Path) -> str | None:
 
 
 def drop_damaged(folder: Path) -> None:
-    """Remove the modules whose files are not those that were compiled; each is said."""
+    """Remove the modules whose files are not those that were compiled; each is said. So are, without a word, those of
+    which nobody noted the files: a process that was killed compiled them; one that lives may be about to note them."""
+    alone = not _marks(folder) - {f"p{os.getpid()}"}
     for module in _modules(folder):
         noted = _noted(module)
-        if noted and any(_sha256(module / name) != digest for name, digest in noted.items()):
+        if not noted and alone:
+            _drop(module)
+        elif noted and any(_sha256(module / name) != digest for name, digest in noted.items()):
             notice(f"kernel {module.name} in {folder} is damaged; compiling it again")
             _drop(module)
 
@@ -101,7 +105,7 @@ def remove_unfinished(folder: Path) -> None:
     A process is known by its number and by a file that it holds; its number alone may be that of one elsewhere.
     """
     gone = {path.name.partition(".")[0] for path in remove_leftovers(folder, "*.tmp")}
-    there = {path.name.partition(".")[0] for path in folder.glob("p*.tmp")}
+    there = _marks(folder)
     for path in folder.glob("*_p*_t*"):
         match = _UNFINISHED.search(path.name)
         with suppress(OSError):
@@ -126,6 +130,11 @@ def remove_modules(folder: Path, before: float | None = None) -> int:
                 size += sum(info.st_size for info in files)
                 _drop(module)
     return size
+
+
+def _marks(folder: Path) -> set[str]:
+    """Processes that may compile into a folder, such as p123 (:func:`enter`)."""
+    return {path.name.partition(".")[0] for path in folder.glob("p*.tmp")}
 
 
 def _modules(folder: Path) -> list[Path]:

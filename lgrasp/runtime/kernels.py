@@ -12,7 +12,7 @@ import warp as wp
 
 import lgrasp
 from lgrasp.runtime.cores import cores
-from lgrasp.runtime.kernel_cache import has_compiled, note_checksums
+from lgrasp.runtime.kernel_cache import has_compiled, note_checksums, usable_folder
 
 
 def import_all() -> None:
@@ -47,16 +47,18 @@ def first_time(device: str) -> str:
 
 
 def load_kernels(device: str, modules: list[str], progress: Callable[[str, float], None] | None = None) -> None:
-    """Compile and load modules for one device, several at a time.
+    """Compile and load modules for one device, several at a time; elsewhere than so far if the disk has become full.
 
     Args:
         device: ``cpu`` or ``cuda:N``.
         progress: called with (module that is ready, share done).
     """
+    folder = usable_folder(Path(wp.config.kernel_cache_dir))
+    wp.config.kernel_cache_dir = str(folder)
     with ThreadPoolExecutor(min(cores(), 4)) as pool:
         waiting = {pool.submit(wp.load_module, name, device): name for name in modules}
         for done, future in enumerate(as_completed(waiting), 1):
             future.result()
+            note_checksums(folder)
             if progress:
                 progress(f"kernels {waiting[future]}", done / len(waiting))
-    note_checksums(Path(wp.config.kernel_cache_dir))

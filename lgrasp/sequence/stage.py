@@ -8,7 +8,7 @@ from lgrasp.sequence.params import SequenceParams
 from lgrasp.sequence.room import room_left
 from lgrasp.stages.context import Context
 
-VERSION = 2
+VERSION = 3
 
 
 def run(

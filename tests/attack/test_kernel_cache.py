@@ -7,10 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import warp as wp
 
 from lgrasp.engine.cache import Cache
 from lgrasp.files import discard_temporaries
+from lgrasp.runtime import kernel_cache
 from lgrasp.runtime.kernel_cache import drop_damaged, enter, note_checksums, remove_unfinished, usable_folder
+from lgrasp.runtime.kernels import load_kernels
 
 CODE = """
 import importlib
@@ -106,6 +109,34 @@ def test_every_damage_is_seen(said, tmp_path):
     drop_damaged(tmp_path)
     assert sorted(line.split()[1] for line in said) == sorted(DAMAGE)
     assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+
+
+def test_kernels_that_nobody_noted(said, tmp_path):
+    def compiled() -> Path:
+        (tmp_path / "wp_a").mkdir(exist_ok=True)
+        (tmp_path / "wp_a" / "code.o").touch()  # cut off as the machine went down
+        return tmp_path / "wp_a"
+
+    module, other = compiled(), tmp_path / "p1.x.tmp"
+    other.touch()
+    drop_damaged(tmp_path)
+    assert module.exists(), "another process may be about to note them"
+    other.unlink()
+    drop_damaged(tmp_path)
+    assert not module.exists()
+    (compiled() / "sha256.json").touch()
+    drop_damaged(tmp_path)
+    assert not module.exists()
+    assert said == []
+
+
+def test_a_disk_that_becomes_full(said, tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(kernel_cache, "LEAST_FREE", 1 << 62)
+    load_kernels("cpu", [])
+    assert wp.config.kernel_cache_dir != str(tmp_path)
+    (line,) = said
+    assert "disk full" in line
 
 
 def test_a_folder_that_cannot_be_made(said, tmp_path):

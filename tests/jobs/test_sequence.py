@@ -87,6 +87,15 @@ def test_spaces_move_their_joints_only(inputs, found):
             assert not (free & ~inputs.spaces[space].joints).any()
 
 
+def test_room_is_that_of_the_fingers_that_are_free_now(inputs, found):
+    tree = inputs.hand.tree
+    first, second = found.levels
+    idle = np.stack([~second.used[:, tree.own_dofs(g)].any(1) for g in range(tree.groups)], 1).any(1)
+    room, before = second.metrics["room"], first.metrics["room"][second.parent]
+    assert (room[~idle] == 0).all()
+    assert (room < before).any(), "a row has the room of the row that it continues"
+
+
 def test_contacts_are_on_both_sides_of_the_space(inputs, found):
     """Each grasp touches with two links, one of each side; the palm's link does not move."""
     tree = inputs.hand.tree
