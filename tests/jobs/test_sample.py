@@ -62,7 +62,7 @@ def shards(asked, tmp_path_factory):
 @pytest.fixture(scope="module")
 def network(shards, cache, tmp_path_factory):
     out = tmp_path_factory.mktemp("network") / "net.pt"
-    params = DiffuserParams.model_validate(TINY | {"steps": 150})
+    params = DiffuserParams.model_validate(TINY | {"steps": 300})
     run(DiffuserJob(shards=(shards,), out=out, params=params, device="cpu", cache=cache))
     return out
 

@@ -43,7 +43,7 @@ def _bottle() -> trimesh.Trimesh:
 
 
 def _hammer() -> trimesh.Trimesh:
-    """Hammer of 250 mm length: oval handle, round face and wedge peen."""
+    """Hammer of 248 mm length: oval handle, round face and wedge peen."""
     handle = _hull(_ball((0, 0, 13), 11), _ball((0, 3, 13), 11), _ball((0, 0, 180), 8), _ball((0, 3, 180), 8))
     neck = _hull(_ball((0, 1.5, 175), 8), _ball((0, 1.5, 230), 7))
     head = _hull(_rounded_box((26, 24, 26), 3, (-2, 1.5, 235)))
