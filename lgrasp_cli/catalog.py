@@ -99,7 +99,7 @@ def list_pipelines() -> Answer:
 @pipelines.command("show")
 @reporting
 def show_pipeline(name: Annotated[str, Argument(help="Name of a pipeline, or a YAML file.", **PIPELINE)]) -> Answer:
-    """Show every parameter of a pipeline with its value and meaning.
+    """Show every parameter of a pipeline: value, what it accepts, meaning.
 
     Example: lgrasp pipelines show swift
     """
@@ -108,7 +108,9 @@ def show_pipeline(name: Annotated[str, Argument(help="Name of a pipeline, or a Y
     data = describe_pipeline(name)
     head = f"{data['name']}: {data['description']}" if data["description"] else data["name"]
     rows = [
-        (part, key, " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value), words)
-        for part, key, value, words in data["parameters"]
+        (part, key, " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value), accepted, words)
+        for part, key, value, accepted, words in data["parameters"]
     ]
-    return Answer(data, [head, TextTable(("part", "parameter", "value", "meaning"), rows, right=("value",))])
+    return Answer(
+        data, [head, TextTable(("part", "parameter", "value", "accepted", "meaning"), rows, right=("value",))]
+    )

@@ -1,5 +1,6 @@
 """What can be used by name: hands, objects, pipelines, networks; JSON-serialisable. Light to import."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from lgrasp.learn.networks import find_network, known_networks, read_card
 from lgrasp.object.find import list_objects as named_objects
 from lgrasp.paths import data_dirs, is_installed, pip_line
 from lgrasp.policy.names import SHIPPED, shipped_policy
+
+_MOST_TOLD = 1 << 62  # limits of whole numbers beyond are those of 64 bits
 
 
 def list_hands() -> list[dict[str, Any]]:
@@ -106,12 +109,39 @@ def _told(path: Path, name: str, kind: str, hand: str, report: dict[str, Any], *
     return {"name": name, "kind": kind, "hand": hand, "file": str(path), "bytes": path.stat().st_size, "report": report}
 
 
+def _about(params: BaseModel, key: str) -> tuple[str, str]:
+    """What a parameter accepts, and its meaning."""
+    return _accepted(params, key), _meaning(params, key)
+
+
+def _accepted(params: BaseModel, key: str) -> str:
+    """The values that a parameter accepts: a range, or a choice; "" where its type says it."""
+    schema = _properties(type(params))[key]
+    given = {name: value for kind in schema.get("anyOf", [schema]) for name, value in kind.items()}
+    if "enum" in given:
+        return ", ".join(map(str, given["enum"]))
+    low, high = given.get("minimum"), given.get("maximum")
+    if low is not None and high is not None:
+        return f"{_short(low)} to {_short(high)}"
+    ends = {">=": low, ">": given.get("exclusiveMinimum"), "<=": high, "<": given.get("exclusiveMaximum")}
+    return ", ".join(f"{sign} {_short(end)}" for sign, end in ends.items() if end is not None and end < _MOST_TOLD)
+
+
+@cache
+def _properties(model: type[BaseModel]) -> dict[str, Any]:
+    return model.model_json_schema()["properties"]
+
+
+def _short(number: float) -> str:
+    return f"{number:,}" if isinstance(number, int) else f"{number:g}"
+
+
 def _meaning(params: BaseModel, key: str) -> str:
     return type(params).model_fields[key].description or ""
 
 
 def describe_pipeline(name: str) -> dict[str, Any]:
-    """Every resolved parameter of a pipeline as (part, parameter, value, meaning).
+    """Every resolved parameter of a pipeline as (part, parameter, value, what is accepted, meaning).
 
     Raises:
         ConfigError: no such pipeline, or a wrong one.
@@ -119,17 +149,17 @@ def describe_pipeline(name: str) -> dict[str, Any]:
     pipeline = load_pipeline(name)
     sections = ((part.name, params) for part, params in pipeline.sections)
     parts = [*((name, getattr(pipeline, name)) for name in ("bounds", "steer", "object", "field")), *sections]
-    rows: list[tuple[str, str, Any, str]] = [
-        ("", "seed", pipeline.seed, "Base seed of all stages."),
-        *(("", key, getattr(pipeline, key), _meaning(pipeline, key)) for key in ("effort", "patience")),
+    rows: list[tuple[str, str, Any, str, str]] = [
+        ("", "seed", pipeline.seed, _accepted(pipeline, "seed"), "Base seed of all stages."),
+        *(("", key, getattr(pipeline, key), *_about(pipeline, key)) for key in ("effort", "patience")),
     ]
     for part, params in parts:
         for key, value in params.model_dump(mode="json").items():
             inner = getattr(params, key)
             if isinstance(inner, BaseModel):
-                rows += [(part, f"{key}.{name}", value[name], _meaning(inner, name)) for name in value]
+                rows += [(part, f"{key}.{name}", value[name], *_about(inner, name)) for name in value]
             else:
-                rows.append((part, key, value, _meaning(params, key)))
+                rows.append((part, key, value, *_about(params, key)))
     return {
         "name": pipeline.name,
         "description": pipeline.description,
