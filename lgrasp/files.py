@@ -68,7 +68,7 @@ def check_folder(out: Path) -> None:
     """
     nearest = next(p for p in (out, *out.absolute().parents) if os.path.lexists(p))
     if not nearest.is_dir():
-        what = "leads nowhere" if nearest.is_symlink() and not nearest.exists() else "is a file"
+        what = "is a file" if nearest.exists() else "leads nowhere"
         raise OutputError(f"output folder {out} cannot be made: {nearest} {what}; choose another with --out")
     try:
         tempfile.TemporaryFile(dir=nearest).close()

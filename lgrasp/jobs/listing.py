@@ -102,7 +102,8 @@ def _policy_card(path: Path) -> dict[str, Any]:
     from lgrasp.policy.model import read_policy  # numpy
 
     policy = read_policy(path)
-    return {"kind": "pose", "hand": policy.hand, "report": policy.about["report"]}
+    report = policy.about["report"] | {"proposals": policy.proposals}  # which need not be what the training proposed
+    return {"kind": "pose", "hand": policy.hand, "report": report}
 
 
 def _told(path: Path, name: str, kind: str, hand: str, report: dict[str, Any], **_: Any) -> dict[str, Any]:

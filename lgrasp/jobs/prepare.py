@@ -1,9 +1,7 @@
 """Make and describe the inputs of a job one by one: a contact field, a mesh, a preprocessed object."""
 
-import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,7 +54,7 @@ def prepare_field(
         "seconds": time.perf_counter() - start,
         "cached": load.hits["field"],
         "device": where.name,
-        "file": _kept(cache.path("field", keys.field)),
+        "file": _file(cache, "field", keys.field),
     }
 
 
@@ -84,13 +82,13 @@ def prepare_object(cache: Cache, mesh: str, params: ObjectParams, *, scale: floa
         "sdf_cell": model.sdf_cell,
         "seconds": time.perf_counter() - start,
         "cached": load.hits["object"],
-        "file": _kept(cache.path("object", key)),
+        "file": _file(cache, "object", key),
     }
 
 
-def _kept(path: Path) -> str | None:
+def _file(cache: Cache, kind: str, key: str) -> str | None:
     """A file of the cache, None if it could not be written."""
-    return str(path) if os.path.exists(path) else None
+    return str(cache.path(kind, key)) if cache.has(kind, key) else None
 
 
 def describe_object(mesh: str, scale: float) -> dict[str, Any]:

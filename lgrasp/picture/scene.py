@@ -18,7 +18,6 @@ from lgrasp.hand.surface import joined_mesh
 from lgrasp.hand.urdf import Urdf
 
 _SHARP = 0.8  # least cosine between a face and its corner's mean normal; edges of less are sharp
-_TABLE = 0.2, 0.2, 0.001  # [m]
 _MOST_FACES = 8000  # of a link
 _CLOUD_DOT = 0.0012  # [m] radius of a point of a cloud
 _MOST_CLOUD_DOTS = 4000
@@ -192,9 +191,9 @@ def _table(placed: Sequence[PlacedObject], rows: GraspRows, row: int) -> np.ndar
     return placed[0].pose @ T
 
 
-def table_piece() -> trimesh.Trimesh:
-    """A piece of a table, its top at z = 0."""
-    return trimesh.creation.box(_TABLE).apply_translation([0, 0, -_TABLE[2] / 2])
+def table_piece(side: float = 0.2, thickness: float = 0.001) -> trimesh.Trimesh:
+    """A square piece of a table [m], its top at z = 0."""
+    return trimesh.creation.box((side, side, thickness)).apply_translation([0, 0, -thickness / 2])
 
 
 def split_edges(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -9,7 +9,7 @@ import trimesh
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.draw import OBJECTS, TABLE, rgb
-from lgrasp.picture.scene import STAGES, ContactMarks, GraspScene, HandShape, PlacedObject, Step
+from lgrasp.picture.scene import STAGES, ContactMarks, GraspScene, HandShape, PlacedObject, Step, table_piece
 from lgrasp.scenes.records import SceneRecord
 from lgrasp.view.figure import GraspFigure, add_mesh, painted, place, show_all, stage_marks
 from lgrasp.view.front import row_link
@@ -36,7 +36,7 @@ class TableView(View):
         for i, placed in enumerate(self._objects):
             nodes.append(add_mesh(server.scene, f"/object{i}", placed.mesh, OBJECTS[i % len(OBJECTS)]))
             place(nodes[-1], placed.pose)
-        self._table = trimesh.creation.box((scene.table, scene.table, _THICK)).apply_translation([0, 0, -_THICK / 2])
+        self._table = table_piece(scene.table, _THICK)
         nodes.append(add_mesh(server.scene, "/table", self._table, TABLE))
         colours = np.array([rgb(TABLE), *(rgb(colour) for colour in OBJECTS)], np.uint8)
         which = np.where(scene.cloud.labels == 0, 0, 1 + (scene.cloud.labels - 1) % len(OBJECTS))
