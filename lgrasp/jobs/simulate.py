@@ -22,6 +22,7 @@ from lgrasp.jobs.verdicts import VerdictJob
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.kept import Keeper
+from lgrasp.simulate.engines import SOLVERS
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.protocol import NO_TABLE, Protocol
 from lgrasp.simulate.run import check_installed, on_cpu, protocol_text, verdicts
@@ -51,7 +52,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
 
     def settings(self) -> dict[str, Any]:
         described = self.protocol.model_dump(mode="json")
-        return described | {"all_directions": self._all, "device": self._kind()}
+        return described | SOLVERS[self.protocol.engine] | {"all_directions": self._all, "device": self._kind()}
 
     @property
     def _all(self) -> bool:
@@ -63,6 +64,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         # what shards do not tell that were written before there was a choice
         older = {"engine": "mujoco", "draws": None, "lift": None, "shake": None}
         found = older | super().told(protocol) | {"device": device}
+        if found["engine"] == "physx" and isinstance(found.get("solver"), dict):
+            found["solver"] = {"persistent_contacts": True} | found["solver"]
         # all of them are more than is asked for, if not all are
         return found | {"all_directions": bool(found.get("all_directions")) and self._all}
 

@@ -21,7 +21,7 @@ SOLVER = {
     "modulus": MODULUS,
     "dissipation": DISSIPATION,
     "approximation": APPROXIMATION,
-    "not_used": ("torsion", "impratio", "noslip", "softness"),
+    "not_used": ["torsion", "impratio", "noslip", "softness"],
 }
 """What decides a verdict besides the protocol, and the numbers of the protocol that mean nothing here."""
 

@@ -25,10 +25,18 @@ def check_engine(engine: EngineName) -> None:
         {"physx": import_physx, "drake": import_drake}[engine]()
 
 
-def engine_text(engine: EngineName, device: str) -> tuple[str, dict[str, Any]]:
-    """Name and version of a simulator, and what decides its verdicts besides the protocol."""
+SOLVERS: dict[EngineName, dict[str, Any]] = {
+    "mujoco": {},
+    "physx": {"solver": physx_world.SOLVER},
+    "drake": {"solver": drake_world.SOLVER},
+}
+"""What decides the verdicts of a simulator besides the protocol."""
+
+
+def engine_text(engine: EngineName, device: str) -> str:
+    """Name and version of a simulator."""
     if engine == "physx":
-        return f"physx by sapien {import_physx().__version__}", {"solver": physx_world.SOLVER}
+        return f"physx by sapien {import_physx().__version__}"
     if engine == "drake":
-        return f"drake {version('drake')}", {"solver": drake_world.SOLVER}
-    return f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}", {}
+        return f"drake {version('drake')}"
+    return f"{'mujoco' if device == 'cpu' else 'mujoco_warp'} {import_mujoco().__version__}"

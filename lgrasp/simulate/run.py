@@ -18,7 +18,7 @@ from lgrasp.grasp.records import GraspRows
 from lgrasp.grasp.schema import POSTURES
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.runtime.processes import ProcessPool, none_killed
-from lgrasp.simulate.engines import check_engine, engine_text
+from lgrasp.simulate.engines import SOLVERS, check_engine, engine_text
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.protocol import PROTOCOLS, Protocol
@@ -286,14 +286,13 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
         | protocol.load(solid.volume).model_dump(exclude={"mass", "stiffness"} if protocol.draws else None)
         for solid in scene.objects
     ]
-    simulator, more = engine_text(protocol.engine, device)
     return protocol.text(
-        simulator=simulator,
+        simulator=engine_text(protocol.engine, device),
         all_directions=all_directions,
         ends_early=True,
         chunk=chunk_of(protocol),
         objects=objects,
-        **more,
+        **SOLVERS[protocol.engine],
     )
 
 

@@ -80,6 +80,24 @@ def test_another_simulator_adds_its_own_columns(cli, grasps, engine: str):
     assert cli("simulate", grasps, "--engine", "bullet").code == 2
 
 
+def test_verdicts_of_another_solver_are_not_taken_for_these(cli, grasps):
+    """Contacts of PhysX were once found by persistent manifolds, and shards did not say so."""
+    need("physx")
+    path = min(grasps.glob("*.h5"))
+    assert cli("simulate", path, "--engine", "physx").code == 0
+    with h5py.File(path, "r+") as file:
+        for name, column in file["grasps/physics"].items():
+            if name.startswith("physx_fc"):
+                protocol = json.loads(column.attrs["protocol"])
+                assert protocol["solver"].pop("persistent_contacts") is False
+                column.attrs["protocol"] = json.dumps(protocol, sort_keys=True)
+    result = cli("simulate", path, "--engine", "physx")
+    assert result.code == 2
+    assert "solver.persistent_contacts: True there, False requested" in result.err
+    assert cli("simulate", path, "--engine", "physx", "--overwrite").code == 0
+    assert cli("simulate", path, "--engine", "physx").code == 0
+
+
 def test_random_draws(cli, grasps, tmp_path):
     """The shares that hold in all draws and on the mean; readers take the columns, beside those of fc."""
     path, other = sorted(grasps.glob("*.h5"))
