@@ -44,25 +44,37 @@ def gather(
         ShardError: A path does not exist, a file that was named cannot be used, or no shard is left.
     """
     found: list[Gathered[T]] = []
+    merged: dict[int, set[Any]] = {}  # number of a file -> rows that it was merged from
     first: dict[Any, int] = {}  # rows -> number of their best file so far
     twice: dict[int, int] = {}  # number of a file -> of the one that it repeats
     by_name = set(named_files(paths))
 
-    def read(path: Path) -> tuple[T, Any]:
+    def read(path: Path) -> tuple[T, set[Any], bool]:
         with ShardReader(path, invalid=invalid) as reader:
-            return look(reader), _rows_of(reader)
+            return look(reader), _rows_of(reader), bool(reader.header.merged_from)
 
-    for number, (path, folder, (value, rows)) in enumerate(sound_files(paths, read, leave_out=leave_out)):
+    for number, (path, folder, (value, rows, is_merged)) in enumerate(sound_files(paths, read, leave_out=leave_out)):
         found.append(Gathered(path, path.relative_to(folder), value))
-        if rows is None or path in by_name:
+        if not rows or path in by_name:
             continue
-        best = first.setdefault(rows, number)
+        if is_merged:
+            merged[number] = rows
+            continue
+        best = first.setdefault(*rows, number)
         if best == number or found[best].path.parent == path.parent:
             continue
         if _rank(path) > _rank(found[best].path):
-            first[rows], twice[best] = number, number
+            first |= dict.fromkeys(rows, number)
+            twice[best] = number
         else:
             twice[number] = best
+    for number, rows in sorted(merged.items(), key=lambda item: (len(item[1]), item[0])):
+        there = {first[one] for one in rows if one in first}
+        if rows <= first.keys():
+            twice[number] = min(there)
+        else:
+            twice |= dict.fromkeys(there - merged.keys(), number)
+            first |= dict.fromkeys(rows, number)
     if twice:
         other, best = min(twice.items())
         told = f"{found[other].path} (rows of {found[best].path})"
@@ -99,11 +111,13 @@ def sound_files(
     return found
 
 
-def _rows_of(reader: ShardReader) -> Any:
-    """The same for shards of the same candidates of a run; None where a shard does not tell."""
+def _rows_of(reader: ShardReader) -> set[Any]:
+    """The same for shards of the same candidates of a run, several in a merged file; none where that is not told."""
     header = reader.header
     key = header.config.get("run_key")
-    return (key, header.shard_index, *reader.object_ids) if isinstance(key, str) and header.shard_index >= 0 else None
+    indices = [part.get("shard_index") for part in header.merged_from] or [header.shard_index]
+    told = isinstance(key, str) and all(isinstance(index, int) and index >= 0 for index in indices)
+    return {(key, index, *reader.object_ids) for index in indices} if told else set()
 
 
 def _rank(path: Path) -> tuple[bool, int, int]:

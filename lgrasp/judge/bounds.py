@@ -34,6 +34,8 @@ TORQUE_SCALE = 10.0
 DUPLICATE_T, DUPLICATE_R, DUPLICATE_Q = 5e-3, math.radians(5.0), 0.1
 """Translation [m], rotation [rad], joint difference [rad] that count as 1; a sliding joint's is a translation."""
 
+MOST = 1e6
+"""Of any number of a row, whatever its unit."""
 UNIT_QUATERNION = 1e-3
 UNIT_NORMAL = 1e-2
 

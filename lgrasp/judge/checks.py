@@ -11,7 +11,7 @@ from lgrasp.judge import bounds
 from lgrasp.judge.collision import PlacedSolids, hand_in_object, object_in_object
 from lgrasp.judge.hand import pose_transforms
 from lgrasp.judge.meshes import PROBES
-from lgrasp.judge.shard import JudgedShard
+from lgrasp.judge.shard import JudgedShard, in_range
 from lgrasp.judge.solids import on_links
 from lgrasp.judge.steer import Asked, disobeys, on_table
 from lgrasp.judge.wrench import ferrari_canny, force_errors, wrench_residual
@@ -29,6 +29,7 @@ CHECKS: dict[str, tuple[str, float]] = {
     "normal": ("normal_deg", bounds.NORMAL_DEG),
     "stored_normal": ("stored_normal_deg", bounds.NORMAL_DEG),
     "residual": ("residual", bounds.RESIDUAL),
+    "forces": ("force_error", bounds.RESIDUAL),
     "object_object": ("object_object_mm", 1e3 * bounds.PENETRATION),
     "table": ("below_table_mm", 0.0),
     "resting": ("resting_gap_mm", 1e3 * bounds.RESTING_GAP),
@@ -110,13 +111,13 @@ class RowChecks:
         pose = np.asarray(g["object_pose"], float)
         with np.errstate(invalid="ignore", over="ignore"):
             unit = np.abs(np.linalg.norm(pose[..., 3:], axis=-1) - 1.0) <= bounds.UNIT_QUATERNION
-        bad = (present & ~(np.isfinite(pose).all(axis=-1) & unit)).any(axis=1)
+        bad = (present & ~(in_range(pose).all(axis=-1) & unit)).any(axis=1)
         for name in ("q", "q_pregrasp", "q_squeeze"):
             if name in g:
-                bad |= ~np.isfinite(g[name]).all(axis=1)
+                bad |= ~in_range(g[name]).all(axis=1)
         for name in ("contact_points", "contact_normals", "contact_forces"):
             if name in g:
-                bad |= (self.used & ~np.isfinite(g[name]).all(axis=-1)).any(axis=(1, 2))
+                bad |= (self.used & ~in_range(g[name]).all(axis=-1)).any(axis=(1, 2))
         self.failed["finite"] = bad
         names = self.shard.link_names
         known = np.array([self.hand.index.get(name, -1) for name in names] + [-1])
@@ -140,21 +141,23 @@ class RowChecks:
         )
 
     def _joints(self) -> dict[str, np.ndarray]:
-        """Limits and mimic relations; values of all joints."""
-        n = len(self.good)
-        stored, full = self._values("q"), self._full("q")
-        own, driven, relation = (np.zeros(n) for _ in range(3))
-        for name, j in self.hand.movable.items():
-            excess = np.maximum(np.maximum(j.lower - full[name], full[name] - j.upper), 0.0)
-            if j.mimic is None:
-                own = np.maximum(own, excess)
-            else:
-                driven = np.maximum(driven, excess)
-                relation = np.maximum(relation, np.abs(stored.get(name, full[name]) - full[name]))
+        """Limits, mimic relations and couplings, of the open hand too; values of all joints at the grasp."""
+        own, driven, relation = (np.zeros(len(self.good)) for _ in range(3))
+        for posture in [name for name in ("q", "q_pregrasp") if name in self.g]:
+            stored, full = self._values(posture), self._full(posture)
+            for name, j in self.hand.movable.items():
+                excess = np.maximum(np.maximum(j.lower - full[name], full[name] - j.upper), 0.0)
+                if j.mimic is None:
+                    own = np.maximum(own, excess)
+                else:
+                    driven = np.maximum(driven, excess)
+                    relation = np.maximum(relation, np.abs(stored.get(name, full[name]) - full[name]))
+            for name, (of, multiplier, offset) in self.shard.couplings.items():
+                relation = np.maximum(relation, np.abs(full[name] - multiplier * full[of] - offset))
         self._set("limits", own)
         self._set("mimic_limits", driven)
         self._set("mimic", relation)
-        return full
+        return self._full("q")
 
     def _values(self, posture: str) -> dict[str, np.ndarray]:
         return dict(zip(self.shard.joint_names, np.asarray(self.g[posture], float)[self.good].T, strict=True))
@@ -300,7 +303,8 @@ class RowChecks:
             if used.any() and "contact_forces" in self.g:
                 names = ("force_balance", "force_normal_sum_error", "force_cone_excess")
                 forces = np.asarray(self.g["contact_forces"], float)[row, o, used]
-                numbers |= dict(zip(names, force_errors(points, inward, forces), strict=True))
+                errors = force_errors(points, given, forces, self.shard.friction)
+                numbers |= dict(zip(names, errors, strict=True)) | {"force_error": max(errors)}
             if used.any() and epsilon:
                 obj = self.shard.objects[self.index[row, o]]
                 numbers["epsilon"] = -ferrari_canny(points, inward, obj.centre_of_mass, obj.radius, self.shard.friction)
@@ -310,6 +314,7 @@ class RowChecks:
             self.values[name][row] = max(each)
         self.values["epsilon"][row] *= -1.0
         self.failed["residual"][row] = not self.values["residual"][row] <= bounds.RESIDUAL
+        self.failed["forces"][row] = self.values["force_error"][row] > bounds.RESIDUAL  # False where none are stored
         self.values["contacts"][row] = sum(len(x) for x in links)
         self.values["links_in_contact"][row] = len(np.unique(np.concatenate(links)))
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lgrasp.judge.bounds import DUPLICATE_Q, DUPLICATE_R, DUPLICATE_T
-from lgrasp.judge.shard import JudgedShard
+from lgrasp.judge.shard import JudgedShard, in_range
 
 SAME_POSE = 1e-6
 
@@ -67,9 +67,9 @@ def count_repeats(shards: Sequence[JudgedShard]) -> Repeats:
     scales: dict[Any, np.ndarray] = {}
     for s in shards:
         q, pose, index = (np.asarray(s.grasps[k]) for k in ("q", "object_pose", "object_index"))
-        good = np.isfinite(q).all(axis=1) & (index < len(s.objects)).all(axis=1) & (index >= 0).any(axis=1)
+        good = in_range(q).all(axis=1) & (index < len(s.objects)).all(axis=1) & (index >= 0).any(axis=1)
         turned = np.linalg.norm(pose[..., 3:].astype(float), axis=-1) > 0.0
-        good &= ((index < 0) | (np.isfinite(pose).all(axis=-1) & turned)).all(axis=1)
+        good &= ((index < 0) | (in_range(pose).all(axis=-1) & turned)).all(axis=1)
         pose = np.where((index >= 0)[..., None], pose, np.nan).astype(float)
         for combo in np.unique(index[good], axis=0):
             m = good & (index == combo).all(axis=1)

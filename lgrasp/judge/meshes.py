@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from scipy.ndimage import label
-from scipy.spatial import QhullError, cKDTree
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from trimesh.units import unit_conversion
 
@@ -303,9 +303,6 @@ def clean_mesh(vertices: np.ndarray, faces: np.ndarray) -> trimesh.Trimesh:
 def mass_centre(mesh: trimesh.Trimesh) -> np.ndarray:
     """Centre of mass at uniform density, (3,): of the mesh if it is closed, else of its convex hull; where bodies
     overlap, of random points inside any.
-
-    Raises:
-        ValueError: not closed, and flat.
     """
     n = len(mesh.vertices)
     there, back = (np.sort(mesh.edges @ np.array(weights, np.int64)) for weights in ((n, 1), (1, n)))
@@ -316,10 +313,7 @@ def mass_centre(mesh: trimesh.Trimesh) -> np.ndarray:
             if winding.max() > 1.5:
                 return np.asarray(points[winding > 0.5].mean(axis=0))
         return np.asarray(mesh.center_mass)
-    try:
-        return np.asarray(mesh.convex_hull.center_mass)
-    except QhullError:
-        raise ValueError("a mesh that is not closed is flat") from None
+    return np.asarray(mesh.convex_hull.center_mass)
 
 
 def load_mesh(source: Path | bytes, name: str) -> trimesh.Trimesh:

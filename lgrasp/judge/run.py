@@ -16,7 +16,7 @@ from lgrasp.judge.checks import CHECKS, VALUES, RowChecks
 from lgrasp.judge.duplicates import count_repeats
 from lgrasp.judge.files import existing, find_shards
 from lgrasp.judge.report import Report, ShardVerdict
-from lgrasp.judge.shard import JudgedShard, read_shard
+from lgrasp.judge.shard import JudgedShard, not_judged, read_shard
 
 BLOCK = 64
 EPSILON_ROWS = 128
@@ -78,7 +78,11 @@ def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], obj
     blocks = []
     for first in range(0, len(rows), BLOCK):
         step(first)
-        blocks.append(RowChecks(shard, rows[first : first + BLOCK], epsilon=stored and first < EPSILON_ROWS))
+        some, epsilon = rows[first : first + BLOCK], stored and first < EPSILON_ROWS
+        try:
+            blocks.append(RowChecks(shard, some, epsilon=epsilon))
+        except (ValueError, ArithmeticError, LookupError, TypeError) as error:  # of numbers that no check expects
+            raise not_judged(shard.path, error) from error
     values = {k: np.concatenate([np.zeros(0), *(b.values[k] for b in blocks)]) for k in VALUES}
     return ShardVerdict(
         total_rows=len(shard.kept_invalid),

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import trimesh
 
-from lgrasp.judge.bounds import LIMIT_EXCESS, MU, JudgeError
+from lgrasp.judge.bounds import LIMIT_EXCESS, MOST, MU, UNIT_NORMAL, JudgeError
 from lgrasp.judge.collision import POSTURES, JudgedHand, JudgedObject
 from lgrasp.judge.meshes import clean_mesh, load_mesh
 from lgrasp.judge.steer import Asked, JudgedRegions, read_asked
@@ -42,6 +42,7 @@ STEPS: dict[str, tuple[str, ...]] = {
 }
 TABLE: dict[str, tuple[str, ...]] = {"pose": (), "approach": ("3",)}
 OPTIONAL = ("q_pregrasp", "q_squeeze", "contact_forces")
+INTEGERS = ("object_index", "contact_links", "space", "parent", "pose")
 
 
 @dataclass
@@ -61,12 +62,19 @@ class JudgedShard:
     table: dict[str, np.ndarray]  # of rows on a table
     tables: list[np.ndarray]  # (T, 5) of each object
     regions: list[JudgedRegions | None]  # of each object
+    couplings: dict[str, tuple[str, float, float]]  # joint, multiplier and offset that a joint follows, beside the URDF
     metrics: dict[str, tuple[np.ndarray, str]]
     kept_invalid: np.ndarray  # (n,), rows that the file itself calls invalid
     claims: dict[str, str]
     friction: float  # that the stored epsilon is of
     notes: list[str]
     asked: Asked | None
+
+
+def in_range(numbers: np.ndarray) -> np.ndarray:
+    """Where numbers are finite, and small enough to be reckoned with."""
+    with np.errstate(invalid="ignore"):
+        return np.abs(numbers) <= MOST
 
 
 _CACHE: dict[str, Any] = {}
@@ -104,8 +112,9 @@ def _columns(group: h5py.Group, shapes: Mapping[str, tuple[str, ...]], sizes: di
         for size, axis in zip(data.shape, ("N", *axes), strict=False):
             sizes.setdefault(axis, size)
         wanted = tuple(int(axis) if axis.isdigit() else sizes.get(axis, 0) for axis in ("N", *axes))
-        if data.dtype.kind not in "fiub" or data.shape != wanted:
-            raise JudgeError(f"{group.name}/{name}: {data.dtype} of shape {data.shape}, not numbers of shape {wanted}")
+        kinds, what = ("iu", "integers") if name in INTEGERS else ("fiub", "numbers")
+        if data.dtype.kind not in kinds or data.shape != wanted:
+            raise JudgeError(f"{group.name}/{name}: {data.dtype} of shape {data.shape}, not {what} of shape {wanted}")
     return out
 
 
@@ -156,6 +165,8 @@ def read_object(group: h5py.Group, source: Path | None) -> tuple[JudgedObject, s
             raise JudgeError(f"object {name} is a point cloud; give the mesh that it is of: --mesh {name}=PATH")
     if vertices.ndim != 2 or faces.ndim != 2 or (vertices.shape[1], faces.shape[1]) != (3, 3):
         raise JudgeError(f"{group.name}: vertices and faces have shapes {vertices.shape} and {faces.shape}")
+    if not in_range(vertices).all() or np.linalg.matrix_rank(vertices - vertices.mean(axis=0), rtol=1e-9) < 3:
+        raise JudgeError(f"{group.name}: a flat mesh, or vertices that are no numbers")
     key = hashlib.sha256(vertices.tobytes() + faces.tobytes() + str(vertices.dtype).encode()).hexdigest()
     return _cached(key, lambda: JudgedObject(clean_mesh(vertices, faces))), key
 
@@ -166,6 +177,27 @@ def _fives(group: h5py.Group, name: str) -> np.ndarray:
     if found.ndim != 2 or found.shape[1] != 5 or found.dtype.kind != "f":
         raise JudgeError(f"{group.name}/{name}: {found.dtype} of shape {found.shape}, not numbers of shape (n, 5)")
     return found.astype(float)
+
+
+def read_planes(group: h5py.Group) -> np.ndarray:
+    """Planes that an object stands on, or that the hand stays above, (T, 5)."""
+    planes = _fives(group, "tables")
+    unit = np.abs(np.linalg.norm(planes[:, :3], axis=1) - 1.0) <= UNIT_NORMAL
+    if not (unit & in_range(planes[:, 3])).all():
+        raise JudgeError(f"{group.name}/tables: normals of another length than 1, or heights that are no numbers")
+    return planes
+
+
+def read_couplings(told: Any, hand: JudgedHand) -> dict[str, tuple[str, float, float]]:
+    """Joint, multiplier and offset that joints follow by the rules of the hand, of those that the URDF has.
+
+    Raises:
+        KeyError, TypeError, ValueError: the config tells them in a form of its own.
+    """
+    rules = told.get("hand_rules") if isinstance(told, dict) else None
+    mimic = json.loads(rules).get("mimic", {}) if rules else {}
+    found = {name: (str(m["joint"]), float(m["multiplier"]), float(m["offset"])) for name, m in mimic.items()}
+    return {name: follows for name, follows in found.items() if {name, follows[0]} <= hand.movable.keys()}
 
 
 def read_regions(group: h5py.Group) -> JudgedRegions | None:
@@ -192,8 +224,13 @@ def read_shard(path: Path, urdf: Path | None = None, mesh: Mapping[str, Path] | 
     except JudgeError as error:
         raise JudgeError(f"{path}: {error}") from error
     except Exception as error:  # whatever HDF5, trimesh and numbers out of place raise about a file's content
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise JudgeError(f"{path}: cannot be judged: {reason}") from error
+        raise not_judged(path, error) from error
+
+
+def not_judged(path: Path, error: Exception) -> JudgeError:
+    """What a file is told to be whose content raised an error."""
+    reason = " ".join(str(error).split())[:200] or type(error).__name__
+    return JudgeError(f"{path}: cannot be judged: {reason}")
 
 
 def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path]) -> JudgedShard:
@@ -239,8 +276,9 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         grasps=grasps,
         steps=steps,
         table=table,
-        tables=[_fives(f["objects"][name], "tables") for name in objects],
+        tables=[read_planes(f["objects"][name]) for name in objects],
         regions=[read_regions(f["objects"][name]) for name in objects],
+        couplings=read_couplings(told, hand),
         metrics=metrics,
         kept_invalid=columns["valid"] == 0 if "valid" in columns else np.zeros(sizes["N"], bool),
         claims=claims,

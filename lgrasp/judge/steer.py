@@ -121,7 +121,7 @@ def disobeys(
         middle = np.einsum("nij,j->ni", T_objects[:, :3, :3], asked.approach)
         bad |= ~(middle @ asked.facing >= asked.cosine - COSINE_SLACK)
     if asked.plane is not None:
-        bad |= True if planes is None else (np.abs(planes[:, :4] - asked.plane) > PLANE_SLACK).any(axis=1)
+        bad |= True if planes is None else ~(np.abs(planes[:, :4] - asked.plane) <= PLANE_SLACK).all(axis=1)
     if asked.poses is not None:
         bad |= ~(cKDTree(asked.poses).query(_comparable(T_objects))[0] <= POSE_SLACK)
     return bad

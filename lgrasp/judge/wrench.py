@@ -35,13 +35,15 @@ def wrench_residual(points: np.ndarray, inward: np.ndarray, mu: float = MU) -> t
     return float(np.linalg.norm(w)), float(w @ w - (G.T @ w).min())
 
 
-def force_errors(points: np.ndarray, inward: np.ndarray, forces: np.ndarray) -> tuple[float, float, float]:
+def force_errors(
+    points: np.ndarray, inward: np.ndarray, forces: np.ndarray, mu: float = MU
+) -> tuple[float, float, float]:
     """Of stored forces (C, 3): norm of the wrench, error of the normal parts' sum from 1, excess over the cone."""
     torque = TORQUE_SCALE * np.cross(points - points.mean(axis=0), forces).sum(axis=0)
     push = (forces * inward).sum(axis=1)
     side = np.linalg.norm(forces - push[:, None] * inward, axis=1)
     balance = float(np.linalg.norm(np.append(forces.sum(axis=0), torque)))
-    return balance, abs(float(push.sum()) - 1.0), float((side - MU * push).max())
+    return balance, abs(float(push.sum()) - 1.0), float((side - mu * push).max())
 
 
 def ferrari_canny(points: np.ndarray, inward: np.ndarray, centre: np.ndarray, radius: float, mu: float = MU) -> float:

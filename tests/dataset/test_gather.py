@@ -10,6 +10,7 @@ from support.shards import sample_shard
 from lgrasp import notices
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.info import describe
+from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.writer import write_shard
@@ -74,6 +75,21 @@ def test_what_cannot_be_used_is_left_out(tmp_path, said):
     good.unlink()
     with pytest.raises(ShardError, match=r"a/1\.h5"):
         describe(tmp_path / "top")
+
+
+def test_a_merged_file_and_its_sources_count_once(tmp_path, said):
+    """Of a merged file with all of its sources these are taken, with some of them the merged file."""
+    sources = [write(tmp_path / "all" / "x" / f"{index}.h5", index) for index in range(3)]
+    whole, pair, one = (tmp_path / "all" / name for name in ("merged.h5", "x/pair.h5", "one.h5"))
+    for number, path in ((3, whole), (2, pair), (1, one)):
+        merge_shards(sources[:number], path)
+    assert [shard.path for shard in gather(tmp_path / "all")] == sources
+    assert len(GraspDataset(tmp_path / "all")) == 9
+    assert "3 of 6 shards repeat rows of others and are left out" in said[0]
+    for path in (pair, one, sources[0], sources[1]):
+        path.unlink()
+    assert [shard.path for shard in gather(tmp_path / "all")] == [whole]
+    assert [shard.path for shard in gather([whole, *sources[2:]])] == [whole, sources[2]]  # as named
 
 
 def test_the_same_rows_count_once(tmp_path, said):

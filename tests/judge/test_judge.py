@@ -20,6 +20,7 @@ from support.jawshard import CUBE, JAW, PLATE, URDF, row, write_shard
 from typer.testing import CliRunner
 
 from lgrasp.grasp.bounds import GraspBounds
+from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.checks import CHECKS
 from lgrasp.judge.collision import JudgedHand, JudgedObject, PlacedSolids, object_in_object
 from lgrasp.judge.duplicates import distinct_poses, near_duplicates
@@ -73,6 +74,42 @@ def test_valid_row_passes_with_exact_numbers(tmp_path: Path) -> None:
     assert len(deviations) == 6  # gswo twice; what merely has such a word in its name is another number
 
 
+def test_the_open_hand_and_the_couplings_of_the_rules_count(tmp_path: Path) -> None:
+    path = write_shard(tmp_path / "s.h5", [row(), row(), row(q=[0.025, 0.026, 0.3])])
+    coupling = {"slide_right": {"joint": "slide_left", "multiplier": 1.0, "offset": 0.0}}
+    with h5py.File(path, "r+") as f:
+        f.attrs["config"] = json.dumps({"hand_rules": json.dumps({"mimic": coupling})})
+        opened = f["grasps/q"][()] + np.array([0.005, 0.005, 0, 0], "f4")
+        opened[1, 2] = -1.001
+        f["grasps/q_pregrasp"] = opened
+    assert _failed(judge(path)) == [set(), {"limits", "mimic_limits", "mimic"}, {"mimic"}]
+
+
+@pytest.mark.parametrize("told", [0.0, np.nan, 0.5])
+def test_planes_of_no_form_are_refused(tmp_path: Path, told: float) -> None:
+    path = write_shard(tmp_path / "s.h5", [row()])
+    with h5py.File(path, "r+") as f:
+        f["objects/a_cube/tables"] = np.array([[0, 0, told, 0.0, 1.0]], "f4")
+    with pytest.raises(JudgeError, match=r"tables: normals of another length than 1"):
+        judge(path)
+
+
+def test_what_no_check_expects_is_told_in_one_line(tmp_path: Path) -> None:
+    path = write_shard(tmp_path / "s.h5", [row()])
+    with h5py.File(path, "r+") as f:
+        vertices = f["objects/a_cube/vertices"]
+        vertices[:, 2] = 0.0
+    with pytest.raises(JudgeError, match=r"s\.h5: /objects/a_cube: a flat mesh"):
+        judge(path)
+    path = write_shard(tmp_path / "t.h5", [row()])
+    with h5py.File(path, "r+") as f:
+        index = f["grasps/object_index"][()]
+        del f["grasps/object_index"]
+        f["grasps/object_index"] = index.astype("f4")
+    with pytest.raises(JudgeError, match=r"object_index: float32 of shape \(1, 1\), not integers"):
+        judge(path)
+
+
 @pytest.mark.parametrize(("told", "friction"), [(0.4, 0.4), ("0.4", 0.5), (-1.0, 0.5), (None, 0.5)])
 def test_epsilon_is_compared_at_the_friction_of_the_shard(tmp_path: Path, told: Any, friction: float) -> None:
     path = write_shard(tmp_path / "s.h5", [row()])
@@ -103,14 +140,20 @@ def test_planted_defects_are_caught(tmp_path: Path) -> None:
             row(points=[[0, 0.0225, 0], [0, -0.02, 0]]),
             {"contact_on_object", "contact_on_link"},
         ),
-        ("contact beside the jaw", row(points=[[0, 0.02, 0], [0.013, -0.02, 0]]), {"contact_on_link"}),
-        ("flipped normal", row(normals=[[0, -1, 0], [0, -1, 0]]), {"stored_normal"}),
-        ("edge contacts", _tilted(), {"normal", "residual"}),
+        ("contact beside the jaw", row(points=[[0, 0.02, 0], [0.013, -0.02, 0]]), {"contact_on_link", "forces"}),
+        ("flipped normal", row(normals=[[0, -1, 0], [0, -1, 0]]), {"stored_normal", "forces"}),
+        ("edge contacts", _tilted(), {"normal", "residual", "forces"}),
+        ("no forces", row(forces=np.zeros((2, 3))), {"forces"}),
+        ("forces too large", row(forces=[[0, -5, 0], [0, 5, 0]]), {"forces"}),
+        ("forces that pull", row(forces=[[0, 0.5, 0], [0, -0.5, 0]]), {"forces"}),
+        ("forces that slip", row(forces=[[0.3, -0.5, 0], [-0.3, 0.5, 0]]), {"forces"}),
+        ("forces in no balance", row(forces=[[0.1, -0.5, 0], [0.1, 0.5, 0]]), {"forces"}),
+        ("beyond all numbers", row(pose=[0, 0, 1e30, 1, 0, 0, 0]), {"finite"}),
         ("wrong link", row(links=[2, 2]), {"contact_on_link", "normal"}),
         (
             "one-sided",
             row(points=[[0.005, 0.02, 0], [-0.005, 0.02, 0]], normals=[[0, 1, 0]] * 2, links=[1, 1]),
-            {"residual"},
+            {"residual", "forces"},
         ),
         ("no contacts", row(points=np.zeros((0, 3)), normals=np.zeros((0, 3)), links=[]), {"residual"}),
         ("not finite", row(points=nan), {"finite"}),
@@ -125,8 +168,9 @@ def test_planted_defects_are_caught(tmp_path: Path) -> None:
     found = _failed(report)
     assert {name: got for (name, _, _), got in zip(cases, found, strict=False)} == {name: w for name, _, w in cases}
     assert report.values["penetration_mm"][0] == pytest.approx(5.0, abs=1e-3)
-    assert report.values["residual"][9] == pytest.approx(1.0, abs=1e-6)
-    assert report.values["force_balance"][9] == pytest.approx(1.0, abs=1e-6)
+    one_sided = [case[0] for case in cases].index("one-sided")
+    assert report.values["residual"][one_sided] == pytest.approx(1.0, abs=1e-6)
+    assert report.values["force_balance"][one_sided] == pytest.approx(1.0, abs=1e-6)
     assert "self_penetration" in found[-3]
     assert report.values["self_penetration_mm"][-3] == pytest.approx(6.0, abs=1e-3)
     assert report.self_pairs == {"left x right": 1}
@@ -262,7 +306,7 @@ def test_sequences(tmp_path: Path) -> None:
         "ahead": (_put("sequence/parent", (), 15), {"parent"}),
         "other": (_put("object_pose", (0, 2), 0.0351), {"parent"}),
         "space": (_put("sequence/space", (1,), 0), {"parent"}),
-        "one_sided": (_put("contact_links", (1, 1), -1), {"residual"}),
+        "one_sided": (_put("contact_links", (1, 1), -1), {"residual", "forces"}),
     }
     _sequence(tmp_path / "s.h5", **{name: change for name, (change, _) in cases.items()})
     report = judge(tmp_path)

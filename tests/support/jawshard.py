@@ -47,6 +47,7 @@ def row(**changes: Any) -> dict[str, Any]:
         "points": [[0, 0.02, 0.001], [0, -0.02, 0.001]],
         "normals": [[0, 1, 0], [0, -1, 0]],
         "links": [1, 2],
+        "forces": None,
     }
     assert set(changes) <= set(values)
     return values | changes
@@ -63,7 +64,7 @@ def write_shard(
     for i, one in enumerate(rows):
         k = len(one["links"])
         points[i, 0, :k], normals[i, 0, :k], links[i, 0, :k] = one["points"], one["normals"], one["links"]
-        forces[i, 0, :k] = -normals[i, 0, :k] / k
+        forces[i, 0, :k] = -normals[i, 0, :k] / k if one["forces"] is None else one["forces"]
     with h5py.File(path, "w") as f:
         f.attrs["format"], f.attrs["format_version"], f.attrs["complete"] = "lgrasp-shard", "1.0", 1
         f.attrs["pipeline"], f.attrs["config"] = "by hand", '{"bounds": {"profile": "plan"}}'
