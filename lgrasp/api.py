@@ -155,15 +155,17 @@ def generate(
         scale: from the mesh's unit to metres.
         negatives: failed rows that are kept for each grasp; they are not ``valid``.
         workers: threads; 0: one per core.
-        out: folder for shards; none: no file.
+        out: folder for shards; none: no file. Grasps that it holds already count, and are given too.
 
     Raises:
         LgraspError: the hand, the object or an option cannot be used; StarvedError where no grasp is found.
     """
     from lgrasp.jobs.generate import GenerateJob
 
-    what = _asked(hand, n, pipeline, seed, device, workers, out)
-    what["pipeline"] = what["pipeline"].with_steering(**(steer or {}))
+    what = _asked(hand, n, pipeline, seed, device, workers)
+    if not isinstance(steer or {}, Mapping):
+        raise ConfigError(f"steer is a {type(steer).__name__}; accepted is such as {{'fingers': 'thumb,index'}}")
+    what["pipeline"] = what["pipeline"].with_steering(**{str(name): value for name, value in (steer or {}).items()})
     return _done(GenerateJob, out, n, object=_named(object, "object"), scale=scale, negatives=negatives, **what)
 
 
@@ -191,7 +193,7 @@ def sequence(
     """
     from lgrasp.jobs.sequence.job import SequenceJob
 
-    what = _asked(hand, n, pipeline, seed, device, workers, out)
+    what = _asked(hand, n, pipeline, seed, device, workers)
     names = [objects] if isinstance(objects, str) or not isinstance(objects, Iterable) else objects
     return _done(SequenceJob, out, objects=tuple(_named(name, "object") for name in names), scale=str(scale), **what)
 
@@ -364,22 +366,20 @@ def _asked(
     seed: int | None,
     device: "DeviceName",
     workers: int,
-    out: Name | None,
 ) -> dict[str, Any]:
-    """What jobs that search have in common; without a folder all rows are in one shard."""
-    if not isinstance(n, Real):
+    """What jobs that search have in common."""
+    if not isinstance(n, Real) or isinstance(n, bool):
         raise ConfigError(f"n is {n!r}; a whole number is accepted")
     chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(_named(pipeline, "pipeline"))
     what: dict[str, Any] = {"hand": _named(hand, "hand"), "rows": n, "pipeline": chosen.with_seed(seed)}
-    what |= {"device": device, "workers": workers}
-    return what | ({"shard_rows": max(n, 1)} if out is None else {})
+    return what | {"device": device, "workers": workers}
 
 
 @contextmanager
 def _folder(out: Name | None) -> Iterator[Path]:
     """A folder for files that stay, or one that goes."""
     if out is not None:
-        yield Path(out)
+        yield Path(_named(out, "out", "the path of a folder"))
         return
     with temporary_folder() as folder:
         yield folder / "shards"

@@ -93,6 +93,14 @@ ShardPaths = Annotated[tuple[Path, ...], Field(description="Shard files, or fold
 ShardFolder = Annotated[Path, Field(description="Folder of the shards.")]
 
 
+def _parts_of(kind: Any) -> Iterator[Any]:
+    """The plain types in an annotation."""
+    if not (args := get_args(kind)):
+        yield kind
+    for arg in args:
+        yield from _parts_of(arg)
+
+
 class Params(BaseModel):
     """Frozen parameters whose unknown keys fail; keys of the release before are still read, with a notice."""
 
@@ -100,6 +108,18 @@ class Params(BaseModel):
 
     RENAMED: ClassVar[dict[str, str]] = {}
     """Old key -> the field that it is now called; those of the models that this one builds on are read too."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_truths(cls, data: Any) -> Any:
+        """True and False, which Python takes for 1 and 0, are no numbers."""
+        for key, value in data.items() if isinstance(data, dict) else ():
+            given = value if isinstance(value, list | tuple) else [value]
+            if key in cls.model_fields and any(isinstance(one, bool) for one in given):
+                kinds = [*_parts_of(cls.model_fields[key].annotation)]
+                if (int in kinds or float in kinds) and bool not in kinds and Any not in kinds:
+                    raise ValueError(f"'{key}' is {value}, not a number")
+        return data
 
     @model_validator(mode="before")
     @classmethod
@@ -301,8 +321,10 @@ def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], wher
     made = dict(parts)
     for part, values in changes.items():
         model = parts[part]
-        # another profile of bounds brings its own numbers
-        kept = {} if "profile" in values else model.model_dump()
+        kept = model.model_dump()
+        if "profile" in values:  # another profile brings its own numbers, but for those that were given
+            usual = type(model).model_validate({"profile": kept["profile"]}).model_dump()
+            kept = {name: number for name, number in kept.items() if number != usual[name]}
         made[part] = parse_model(type(model), kept | values, f"--set, {part}")
     return made
 

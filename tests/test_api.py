@@ -126,9 +126,34 @@ def test_what_cannot_be_used_is_an_error_of_this_package(grasps, tmp_path):
         lg.plan("allegro", tmp_path / "few.npy", device="cpu")
     with pytest.raises(lg.LgraspError, match="at least two objects, got spere"):
         lg.sequence("allegro", "spere", device="cpu")
-    for n in ("5", None):
+    for n in ("5", None, True):
         with pytest.raises(lg.LgraspError, match=r"n is .*; a whole number is accepted"):
             lg.generate("allegro", "sphere", n)
+    with pytest.raises(lg.LgraspError, match=r"steer is a str; accepted is such as \{'fingers'"):
+        lg.generate("allegro", "sphere", 5, steer="tripod")
+    with pytest.raises(lg.LgraspError, match="pipeline is a int"):
+        lg.load_pipeline(5)
+    with pytest.raises(lg.LgraspError, match="out is a int; the path of a folder"):
+        lg.generate("allegro", "sphere", 5, out=5)
+    with pytest.raises(lg.LgraspError, match=r"hand is a str; what lg\.load_hand gives is accepted"):
+        lg.Refiner("barrett", "mug")
+
+
+def test_hands_of_shards_are_written_once(grasps, tmp_path):
+    path = grasps[:2].save(tmp_path / "few.h5")
+    lg.load_hand(path)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(3):
+        assert lg.load_hand(path).name == grasps.hand.name
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+def test_few_contacts():
+    """One finger and the palm, where a pose has both: no row beyond the poses is read."""
+    swift = lg.load_pipeline("swift").with_settings(["search.contacts=[1, 3]"])
+    rows = lg.generate("allegro", "mug", 30, pipeline=swift, device="cpu")
+    assert len(rows) == 30
+    assert rows.metrics["contacts"].min() >= swift.bounds.min_contacts
 
 
 def test_names_and_no_models():

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
+from statistics import median_high
 from typing import Any
 
 from lgrasp.engine.cache import Cache
@@ -33,8 +33,9 @@ def measure(
 
     Returns:
         For each job ``pipeline``, ``hand``, ``object``, ``grasps``, ``strict``, ``profile``, ``device``; each rate as
-        ``median``, ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run; ``build_seconds`` and
-        ``load_seconds`` of object and field; ``near_duplicates``, ``distinct_poses``, ``starved``, ``peak_rss_mb``.
+        ``median``, ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run (of two, the faster);
+        ``build_seconds`` and ``load_seconds`` of object and field; ``near_duplicates``, ``distinct_poses``,
+        ``starved``, ``peak_rss_mb``.
 
     Raises:
         LgraspError: bad input.
@@ -80,4 +81,4 @@ def _summary(runs: list[dict[str, Any]], built: Built) -> dict[str, Any]:
 
 
 def _spread(values: list[float]) -> dict[str, float]:
-    return {"median": median(values), "min": min(values), "max": max(values)}
+    return {"median": median_high(values), "min": min(values), "max": max(values)}

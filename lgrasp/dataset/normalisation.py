@@ -1,5 +1,6 @@
 """Means and deviations that bring grasps to one scale for a network, measured once."""
 
+import os
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -20,6 +21,7 @@ from lgrasp.geometry.rotations import (
     pose_from_motion,
     sixd_from_matrix,
 )
+from lgrasp.words import listed
 
 _ROWS = 65_536  # at a time
 _LEAST = 1e-6  # a number that varies less stays as it is
@@ -63,7 +65,8 @@ class Normalisation(JsonFile):
             sums, squares = sums + (vectors - shift).sum(0), squares + ((vectors - shift) ** 2).sum(0)
             rows += len(vectors)
         if not rows:
-            raise ConfigError(f"{data.objects}: no rows to measure")
+            places = [str(path) for path in ([paths] if isinstance(paths, str | os.PathLike) else paths)]
+            raise ConfigError(f"{listed(places, 3)}: no rows to measure")
         mean = sums / rows
         std = np.sqrt(np.maximum(squares / rows - mean**2, 0))
         names = (*("x", "y", "z"), *(f"R{i}{j}" for j in (0, 1) for i in range(3)), *hand.joint_names)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from importlib import import_module
 from numbers import Integral
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +17,7 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.params import LISTED, HandParams
 from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
+from lgrasp.paths import name_problem
 from lgrasp.stages.migration import ALIASES, move_to_bounds, stage_name
 from lgrasp.steer.params import NOTHING, Steering
 
@@ -44,14 +46,17 @@ class _Head(Params):
     )
 
 
+_Section = Annotated[dict[str, Any], BeforeValidator(lambda keys: {} if keys is None else keys)]
+
+
 class _Declared(_Head):
     """The file as written."""
 
-    bounds: dict[str, Any] = Field(default_factory=dict)
-    steer: dict[str, Any] = Field(default_factory=dict)
-    hand: dict[str, Any] = Field(default_factory=dict)
-    object: dict[str, Any] = Field(default_factory=dict)
-    field: dict[str, Any] = Field(default_factory=dict)
+    bounds: _Section = Field(default_factory=dict)
+    steer: _Section = Field(default_factory=dict)
+    hand: _Section = Field(default_factory=dict)
+    object: _Section = Field(default_factory=dict)
+    field: _Section = Field(default_factory=dict)
     stages: list[dict[str, dict[str, Any] | None]]
     sequence: dict[str, Any] | None = None
 
@@ -212,7 +217,7 @@ class Pipeline(_Head):
         """
         if seed is None:
             return self
-        if not (isinstance(seed, Integral) and 0 <= seed < 2**63):
+        if isinstance(seed, bool) or not (isinstance(seed, Integral) and 0 <= seed < 2**63):
             raise ConfigError(f"{name} {seed}: need a whole number, 0 <= seed < 2^63")
         return self.model_copy(update={"seed": int(seed)})
 
@@ -259,19 +264,23 @@ def pipeline_files() -> dict[str, Path]:
     return yaml_files("pipelines")
 
 
-def load_pipeline(name: str) -> Pipeline:
+def load_pipeline(name: str | PathLike[str]) -> Pipeline:
     """A pipeline by name or by path.
 
     Raises:
         ConfigError: no such pipeline, or a wrong key or value in it.
     """
-    files = pipeline_files()
+    if not isinstance(name, str | PathLike):
+        raise ConfigError(f"pipeline is a {type(name).__name__}; a name or the path of a file is accepted")
+    name, files = fspath(name), pipeline_files()
     if name in ALIASES and name not in files:
         notice(f"pipeline '{name}' is now called '{ALIASES[name]}'; the old name works in this release only")
         name = ALIASES[name]
     path = find_yaml(name, files, "pipeline")
     where = f"pipeline {path}"
     declared = parse_model(_Declared, read_yaml(path), where)
+    if problem := name_problem(declared.name):
+        raise ConfigError(f"{where}: name '{declared.name}' cannot be used: {problem}")
     declared = declared.model_copy(update=move_to_bounds(declared.bounds, declared.stages, where))
     stages, sequence = [], declared.sequence
     for given, params in (item for entry in declared.stages for item in entry.items()):

@@ -75,10 +75,24 @@ def hand_of_shard(
         ShardError: a mesh of the hand is missing from the shard.
         HandError: the hand cannot be used, or no rules fit it.
     """
-    source = _with_rules(write_hand(record, scratch_folder()), record, config)
+    source = _with_rules(_written(record), record, config)
     if source.note:
         cache.warn(f"the shard does not hold the rules of its hand '{record.name}'; taken are {source.note}")
     return _built(cache, source, device, _surface(config))
+
+
+_WRITTEN: dict[str, Path] = {}  # URDFs by the content of their hands
+
+
+def _written(record: HandRecord) -> Path:
+    """The URDF of a hand as a file, written once while the process lives."""
+    content = hashlib.sha256(repr((record.name, record.urdf, sorted(record.meshes))).encode())
+    for name in sorted(record.meshes):
+        content.update(hashlib.sha256(record.meshes[name]).digest())
+    key = content.hexdigest()
+    if key not in _WRITTEN or not _WRITTEN[key].exists():
+        _WRITTEN[key] = write_hand(record, scratch_folder())
+    return _WRITTEN[key]
 
 
 def arrays_of_shard(cache: Cache, record: HandRecord, config: Mapping[str, Any], device: Device) -> HandArrays:

@@ -64,8 +64,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         # what shards do not tell that were written before there was a choice
         older = {"engine": "mujoco", "draws": None, "lift": None, "shake": None}
         found = older | super().told(protocol) | {"device": device}
-        if found["engine"] == "physx" and isinstance(found.get("solver"), dict):
-            found["solver"] = {"persistent_contacts": True} | found["solver"]
+        if found["engine"] == "physx" and isinstance(solver := found.get("solver"), dict):
+            found["solver"] = {"persistent_contacts": True} | solver
         # all of them are more than is asked for, if not all are
         return found | {"all_directions": bool(found.get("all_directions")) and self._all}
 

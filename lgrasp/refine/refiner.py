@@ -96,6 +96,11 @@ class Refiner(nn.Module):
         device: str | torch.device = "cpu",
     ) -> None:
         super().__init__()
+        for what, given, kinds in (("hand", hand, HandModel), ("object", target, ObjectModel | Target)):
+            if not isinstance(given, kinds):
+                raise ConfigError(f"{what} is a {type(given).__name__}; what lg.load_{what} gives is accepted")
+        if dtype not in (torch.float32, torch.float64):
+            raise ConfigError(f"dtype is {dtype}; torch.float32 and torch.float64 are accepted")
         surface = surface or hand_surface(hand)
         self._hand, self._surface, self._device = hand, surface, torch.device(device)
         self._descent: Descent | None = None  # made when first used

@@ -48,6 +48,18 @@ def test_a_stage_may_be_written_without_parameters(load_text):
     assert load_text(declared(stages=[{n: None} for n in ORDERS[1]])).order == ORDERS[1]
 
 
+def test_a_section_may_have_no_lines_but_comments(load_text):
+    assert load_text(declared(bounds=None, steer=None)) == load_text(declared())
+
+
+def test_another_profile_keeps_the_numbers_that_were_given():
+    robust = load_pipeline("robust")
+    assert robust.with_settings(["bounds.profile=strict"]) == robust
+    plan = robust.with_settings(["bounds.profile=plan", "bounds.max_gswo=0.2"]).bounds
+    assert (plan.friction, plan.max_unresisted_load) == (robust.bounds.friction, robust.bounds.max_unresisted_load)
+    assert (plan.max_gap, plan.max_gswo) == (0.004, 0.2)
+
+
 def test_objects_of_sequences_touch_their_opposition_space_only(load_text):
     for data in (stages(filter={"contacts": "all"}), declared(stages=[{n: None} for n in ORDERS[1]])):
         with pytest.raises(ConfigError, match=r"opposition space only; leave out stage wrap and filter\.contacts"):
@@ -63,6 +75,12 @@ def test_objects_of_sequences_touch_their_opposition_space_only(load_text):
         (stages(place={"proposal": 3}), ["proposal", "did you mean 'proposals'", "place"]),
         (stages(search={"score": "best"}), ["score", "best", "fswo"]),
         (stages(search={"restarts": "many"}), ["restarts", "many"]),
+        (stages(search={"restarts": True}), ["restarts", "True, not a number"]),
+        (stages(search={"contacts": [3, True]}), ["contacts", "True], not a number"]),
+        (stages(search={"contacts": [0, 3]}), ["contacts", "0", "1"]),
+        (declared(bounds={"friction": True}), ["friction", "True, not a number"]),
+        (declared(name="../here"), ["name '../here' cannot be used"]),
+        (declared(name=""), ["name '' cannot be used"]),
         (stages(ik={"gap": -1.0}), ["gap", "-1.0"]),
         (stages(ik={"gap": [1]}), ["gap"]),
         (stages(place={"canonical": float("nan")}), ["canonical", "nan"]),

@@ -32,6 +32,7 @@ QUANTITIES = (
     Quantity("gap", "Gap at contacts", 1.0, "mm", 1e3, 2.0),
     Quantity("normal_error", "Angle of the normals at contacts", np.pi, "deg", 180 / np.pi, 20.0),
     Quantity("gswo", "Friction wrench residual (gswo)", 20.0, bound=0.05, by_friction=True),
+    Quantity("unresisted_load", "Unresisted part of a load", 1.0),
     Quantity("epsilon", "Ferrari-Canny epsilon", 1.5, highest_is_worst=False),
     Quantity("epsilon_exact", "Ferrari-Canny epsilon, exact hull", 1.5, highest_is_worst=False),
     Quantity("volume", "Volume of the wrench hull", 2.0, highest_is_worst=False),

@@ -15,12 +15,14 @@ from lgrasp.simulate.protocol import DIRECTIONS
 
 _HOLDS, _DIRECTIONS = "_holds", "_directions"
 _REACH, _OK = "reach", "_ok"
+_HOLD_TEST, _OF_HOLD = "hold_test", ("hold_success", "hold_probability", "hold_drift")
 _PASSED = re.compile(f"(.+){_HOLDS}|({_REACH}){_OK}")
 
 
 def passed_words(name: str) -> str:
     """What a grasp does that has the verdict of some name."""
-    return "reached by the arm" if name == _REACH else f"hold in physics ({name})"
+    others = {_REACH: "reached by the arm", _HOLD_TEST: "hold in the hold test"}
+    return others.get(name, f"hold in physics ({name})")
 
 
 @dataclass
@@ -66,7 +68,8 @@ class Verdicts:
 
 
 def add_verdicts(into: dict[str, Verdicts], rows: GraspRows, chosen: np.ndarray) -> None:
-    """Count the columns of ``physics/`` of some rows, by protocol; what belongs to none of these is passed over.
+    """Count the columns of ``physics/`` of some rows, by protocol, and the metrics of the hold test; what belongs to
+    none of these is passed over.
 
     Where one protocol's name begins another's, a column is of the longer one. ``chosen`` [n] are indices.
     """
@@ -80,6 +83,9 @@ def add_verdicts(into: dict[str, Verdicts], rows: GraspRows, chosen: np.ndarray)
         text = rows.physics_protocols[column]
         if text not in into[name].protocols:
             into[name].protocols.append(text)
+    for metric, column in zip(_OF_HOLD, (_HOLDS, "_probability", "_drift"), strict=True):
+        if metric in rows.metrics:
+            into.setdefault(_HOLD_TEST, Verdicts()).add(column, rows.metrics[metric][chosen])
 
 
 def _parsed(text: str) -> Any:

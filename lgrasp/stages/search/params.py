@@ -1,11 +1,12 @@
 """Parameters of the search stage."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from lgrasp.choices import ScoreName
 from lgrasp.config import Params
+from lgrasp.math.limits import MAX_GROUPS
 
 MAX_KINDS = 16
 """Most entries of ``contacts``."""
@@ -21,11 +22,12 @@ class SearchParams(Params):
         description="swap: contacts are replaced by others of their finger, and sets tested for friction, fingers for "
         "collision; mutate: as published, contacts move to the best of several mutations.",
     )
-    contacts: tuple[int, ...] = Field(
+    contacts: tuple[Annotated[int, Field(ge=1, le=MAX_GROUPS)], ...] = Field(
         default=(3, 3, 3, 3, 4),
         min_length=1,
         max_length=MAX_KINDS,
-        description="Finger contacts k of the first round, drawn evenly; the largest bounds later rounds.",
+        description="Finger contacts k of the first round, drawn evenly; the largest bounds later rounds. The default "
+        "stands for the hand's own, if it has some.",
     )
     score: ScoreName = Field(
         default="fswo", description="Residual that the search lowers: frictionless or with friction."

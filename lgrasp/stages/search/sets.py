@@ -182,6 +182,8 @@ def start_set(
         chosen[g] = -1
         if usable.size[row, g] > 0:
             available += 1
+    if available == 0:
+        return int(0), int(0), chosen, owner, own  # a row beyond the poses that there are, whose palm nobody wrote
     palm = candidates.poses.palm_surface[row]
     k = params.contacts[wp.min(int(wp.randf(own) * float(params.kinds)), params.kinds - 1)]
     if k > available:

@@ -258,6 +258,21 @@ def test_physics(make, make_shard, tmp_path):
     check_page(text)
 
 
+def test_hold_test(make, make_shard, tmp_path):
+    """Its metrics are told as a verdict is."""
+    shard = make_shard(30)
+    share = np.linspace(0.0, 1.0, 30).astype("f4")
+    metrics = {"hold_success": (share > 0.5).astype("f4"), "hold_probability": share, "hold_drift": np.full(30, 0.25)}
+    held = replace(shard.grasps, metrics=shard.grasps.metrics | {k: v.astype("f4") for k, v in metrics.items()})
+    held = replace(held, metric_units=held.metric_units | dict.fromkeys(metrics, "1"))
+    write_shard(tmp_path / "a.h5", replace(shard, grasps=held))
+    numbers, text = make(tmp_path)
+    found = numbers["hands"][0]["objects"][0]["physics"]["hold_test"]
+    assert (found["run"], found["held"], found["protocols"]) == (30, 15, [])
+    assert found["means"] == pytest.approx({"probability": 0.5, "drift": 0.25})
+    assert "<b>50.0%</b><span>hold in the hold test</span>" in text
+
+
 def test_hands_and_names(make, make_shard, tmp_path):
     """Two hands in one folder, one name for two objects, and names that mean something to HTML and to charts."""
     one, two = make_shard(8, objects=2), make_shard(5, shard_index=1)
