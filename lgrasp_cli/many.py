@@ -115,9 +115,8 @@ def run(
 ) -> None:
     """Run the job of a config, or one job for every hand, object and pipeline that it names.
 
-    Key 'job' tells what to do; a key that it has not is refused with those that it has. Without it, grasps are
-    generated. A job that fails does not stop the others; the exit code is the worst one. Tasks of an array share the
-    files of all jobs.
+    Key 'job' tells what to do; without it, grasps are generated. A job that fails does not stop the others; the exit
+    code is the worst one. Tasks of an array share the files of all jobs.
 
     Example: lgrasp run smoke
     """

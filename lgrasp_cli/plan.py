@@ -104,7 +104,7 @@ def refine(
     """Improve grasps by gradient descent on the surface matching energy, check them again, and write shards.
 
     A refined grasp replaces the original if it passes every check and resists loads better. Rows that pass in neither
-    posture are left out. The bounds are those that the shard's rows passed, or --set bounds.KEY=VALUE.
+    posture are left out. Bounds: those of the shard, or --set bounds.KEY=VALUE.
 
     Example: lgrasp refine grasps/allegro-mug/robust --out refined/allegro-mug
     """
