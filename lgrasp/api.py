@@ -370,7 +370,7 @@ def _asked(
     """What jobs that search have in common."""
     if not isinstance(n, Real) or isinstance(n, bool):
         raise ConfigError(f"n is {n!r}; a whole number is accepted")
-    chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(_named(pipeline, "pipeline"))
+    chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(pipeline)
     what: dict[str, Any] = {"hand": _named(hand, "hand"), "rows": n, "pipeline": chosen.with_seed(seed)}
     return what | {"device": device, "workers": workers}
 

@@ -79,10 +79,12 @@ def _shares(text: str) -> dict[str, float]:
     found: dict[str, float] = {}
     for entry in split(text):
         name, _, share = entry.partition("=")
+        if (name := name.strip()) in found:
+            raise ConfigError(f"--shares {text}: part '{name}' is named twice")
         try:
-            found[name.strip()] = float(share)
+            found[name] = float(share)
         except ValueError:
-            found[name.strip()] = -1.0
+            found[name] = -1.0
     if not all(name and 0 < share < float("inf") for name, share in found.items()):
         raise ConfigError(f"--shares {text}: expected PART=SHARE,... with positive shares, such as train=0.9,test=0.1")
     total = sum(found.values())

@@ -7,7 +7,7 @@ from statistics import fmean
 from typing import Any
 
 import lgrasp
-from lgrasp.bench.page import Page, Published, caveats, over, times
+from lgrasp.bench.page import Page, Published, caveats, check_once, over, times
 from lgrasp.bench.page import Table as Texts
 from lgrasp.bench.rate import measure
 from lgrasp.engine.cache import Cache
@@ -35,8 +35,7 @@ def new_table(config: JobConfig, *, repeat: int, baseline_rows: int, published: 
     """
     named = {kind: [Path(name).stem for name in getattr(config, kind)] for kind in ("pipelines", "hands", "objects")}
     for kind, names in named.items():
-        if twice := [name for name in names if names.count(name) > 1]:
-            raise ConfigError(f"bench: {kind[:-1]} '{twice[0]}' is named twice; each needs a name of its own")
+        check_once(kind[:-1], names)
     settings = {
         "lgrasp": lgrasp.__version__,
         "device": resolve_device(config.device).name,

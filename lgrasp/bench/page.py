@@ -51,6 +51,12 @@ def load_published(name: str) -> Published:
     return parse_model(Published, read_yaml(path), f"published figures {path}")
 
 
+def check_once(what: str, names: list[str]) -> None:
+    """Raises ConfigError if one of the names of things that are measured is given twice."""
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"bench: {what} '{twice[0]}' is named twice; each needs a name of its own")
+
+
 def caveats(published: dict[str, Any]) -> list[str]:
     """The lines below a comparison: the source, its machine, and the differences."""
     lines = [f"published: {published['source']}, on {published['device']}; what differs:"]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median_high
+from statistics import median_low
 from typing import Any
 
 from lgrasp.engine.cache import Cache
@@ -33,7 +33,7 @@ def measure(
 
     Returns:
         For each job ``pipeline``, ``hand``, ``object``, ``grasps``, ``strict``, ``profile``, ``device``; each rate as
-        ``median``, ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run (of two, the faster);
+        ``median``, ``min``, ``max``; ``seconds`` and ``survivors`` of the middle run (of two, the slower);
         ``build_seconds`` and ``load_seconds`` of object and field; ``near_duplicates``, ``distinct_poses``,
         ``starved``, ``peak_rss_mb``.
 
@@ -66,7 +66,7 @@ def _run(job: GenerateJob, built: Built) -> tuple[dict[str, Any], float]:
 
 
 def _summary(runs: list[dict[str, Any]], built: Built) -> dict[str, Any]:
-    middle = sorted(runs, key=lambda data: data["strict_valid_per_s"])[len(runs) // 2]
+    middle = sorted(runs, key=lambda data: data["strict_valid_per_s"])[(len(runs) - 1) // 2]
     same = ("pipeline", "hand", "object", "grasps", "strict", "profile", "device", "survivors", "counts")
     last = ("near_duplicates", "distinct_poses", "starved", "peak_device_mb")
     return {
@@ -81,4 +81,4 @@ def _summary(runs: list[dict[str, Any]], built: Built) -> dict[str, Any]:
 
 
 def _spread(values: list[float]) -> dict[str, float]:
-    return {"median": median_high(values), "min": min(values), "max": max(values)}
+    return {"median": median_low(values), "min": min(values), "max": max(values)}

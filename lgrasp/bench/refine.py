@@ -4,13 +4,14 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import trimesh
 
-from lgrasp.bench.page import Page, Table, caveats, load_published, over
+from lgrasp.bench.page import Page, Table, caveats, check_once, load_published, over
 from lgrasp.choices import EngineName
 from lgrasp.cloud.model import cloud_object
 from lgrasp.engine.cache import Cache
@@ -102,6 +103,8 @@ def bench_hands(
     Raises:
         LgraspError: hand, object, device or protocol are unknown, or the simulator is missing.
     """
+    for what, names in (("hand", hands), ("object", objects)):
+        check_once(what, [Path(name).stem for name in names])
     rules, best, kept = find_protocol(protocol).by(engine), params or PlanParams(), Keeper()
     check_installed("cpu", rules)
     store, at = cache or Cache(), resolve_device(device)

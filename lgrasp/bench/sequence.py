@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.bench.page import Page, Table, caveats, load_published, over, times
+from lgrasp.bench.page import Page, Table, caveats, check_once, load_published, over, times
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.shard import add_counts
 from lgrasp.errors import ConfigError
@@ -53,8 +53,10 @@ def bench_methods(
         so far, with the ``ratios`` of the first method to it, by rows per second.
 
     Raises:
+        ConfigError: a method is named twice.
         PhysicsError: the simulator is not installed.
     """
+    check_once("method", list(methods))
     jobs[0].check_simulator()
     parts = {} if parts is None else parts
     asked: dict[str, list[SequenceJob]] = {}

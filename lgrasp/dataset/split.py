@@ -139,7 +139,7 @@ def draw_split(
         members = sorted({root: sorted(s for s in roots if roots[s] == root) for root in roots.values()}.values())
         place = {name: k for k, group in enumerate(members) for name in group}
         at = np.array([place[group[0]] for g in shards for group in g.keys])
-        keys = np.array([_number(f"{seed}/{roots[group[0]]}") for group in members], np.uint64)
+        keys = np.array([_number(f"{seed}/{group[0]}") for group in members], np.uint64)
     if len(keys) < len(shares):
         raise ShardError(f"rows of {len(keys)} {by}(s) cannot be split into {len(shares)} parts by {by}")
     sizes = np.bincount(at, np.concatenate([g.rows for g in shards]), len(keys))

@@ -16,7 +16,8 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-_NARROWER_CONES = wp.constant(2)  # cones tried before the full one
+_CONES = wp.constant(3)  # round ones that are tried, up to the full friction
+_LEAST_SHARES = wp.constant(wp.vec2(0.5, 0.3))  # of an even share, that each contact is to bear in one of them
 _RESIDUAL_TOLERANCE = wp.constant(1.0e-3)  # by which their residual may be larger
 
 
@@ -41,6 +42,7 @@ def _balanced(
     edges: wp.int32,
     torque_scale: wp.float32,
     stop: wp.float32,
+    least: wp.float32,
     forces: vec3s,
 ):
     """:func:`balance` about the contacts' centroid."""
@@ -48,7 +50,7 @@ def _balanced(
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     for c in range(k):
         arms[c] = points[c] - middle
-    return balance(arms, normals, k, friction, edges, torque_scale, stop, forces)
+    return balance(arms, normals, k, friction, edges, torque_scale, stop, least, forces)
 
 
 @wp.kernel
@@ -67,8 +69,8 @@ def balance_grasps(limits: Limits, places: Places, at: CheckedPostures, found_ou
         found_out.fswo[i] = 1.0
         found_out.gswo[i] = 1.0
         return
-    found_out.fswo[i] = _balanced(points, normals, k, 0.0, 0, limits.torque_scale, 0.0, forces)
-    gswo = _balanced(points, normals, k, limits.friction, CONE_EDGES, limits.torque_scale, BALANCED, forces)
+    found_out.fswo[i] = _balanced(points, normals, k, 0.0, 0, limits.torque_scale, 0.0, 0.0, forces)
+    gswo = _balanced(points, normals, k, limits.friction, CONE_EDGES, limits.torque_scale, BALANCED, 0.0, forces)
     found_out.gswo[i] = gswo
     if gswo > limits.max_gswo:
         if found_out.outcome[i] == Outcome.KEPT:
@@ -144,7 +146,8 @@ def drop_light(
 def center_forces(
     limits: Limits, places: Places, at: CheckedPostures, row: wp.array(dtype=wp.int32), found_out: Findings
 ):
-    """Balancing forces of the rows kept in the narrowest of a few round cones that balances as well.
+    """Balancing forces of the rows kept, in the narrowest of a few round cones that balances as well: if there is one
+    with every contact bearing its part, else with any.
 
     Args:
         row: (m,) hand of each row, -1 none.
@@ -160,9 +163,16 @@ def center_forces(
     if k < 2:
         return
     goal = found_out.gswo[s] + _RESIDUAL_TOLERANCE
-    for step in range(_NARROWER_CONES):
-        mu = limits.friction * (float(step) + 1.0) / float(_NARROWER_CONES + 1)
-        if _balanced(points, normals, k, mu, 0, limits.torque_scale, goal - 0.5 * _RESIDUAL_TOLERANCE, forces) <= goal:
+    enough = goal - 0.5 * _RESIDUAL_TOLERANCE
+    attempts = 3 * _CONES - 1  # in the full cone, any forces that balance are there already
+    for attempt in range(attempts):
+        cone = attempt // 2
+        least = _LEAST_SHARES[attempt % 2] / float(k)
+        if attempt >= 2 * _CONES:
+            cone = attempt - 2 * _CONES
+            least = 0.0
+        mu = limits.friction * float(cone + 1) / float(_CONES)
+        if _balanced(points, normals, k, mu, 0, limits.torque_scale, enough, least, forces) <= goal:
             for c in range(k):
                 found_out.force[s, c] = forces[c]
             break

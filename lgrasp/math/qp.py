@@ -221,6 +221,7 @@ def balance(
     edges: wp.int32,
     torque_scale: wp.float32,
     stop: wp.float32,
+    least: wp.float32,
     forces: vec3s,
 ):
     """min |sum_i (f_i, torque_scale * arm_i x f_i)| with f_i in the friction cone of n_i and sum_i f_i . n_i = 1.
@@ -229,6 +230,7 @@ def balance(
         arms, normals: local arrays; contact i acts at ``arms[i]`` [m] along unit inward normal ``normals[i]``.
         k: number of contacts. mu: friction coefficient. edges: cone edges, 0 for the round cone.
         stop: return as soon as the norm is below this.
+        least: force along its normal that every contact bears, below 1 / k; the cones are of what comes on top.
         forces: (local, MAX_CONTACTS) receives the optimal forces.
 
     Returns:
@@ -238,7 +240,13 @@ def balance(
     p.edges = edges
     p.stop = stop
     p.limit = _NO_LIMIT
-    return least_norm(arms, normals, k, p, forces)
+    p.total = 1.0 - least * float(k)
+    for i in range(k):
+        p.load += wrench(arms[i], normals[i] * least, torque_scale)
+    norm = least_norm(arms, normals, k, p, forces)
+    for i in range(k):
+        forces[i] = forces[i] + normals[i] * least
+    return norm
 
 
 @wp.func

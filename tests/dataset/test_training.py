@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from lgrasp.dataset.normalisation import Normalisation
 from lgrasp.dataset.reader import read_shard
-from lgrasp.dataset.split import Split, make_split
+from lgrasp.dataset.split import Groups, Split, draw_split, make_split
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.torch_stream import GraspIterableDataset
 from lgrasp.dataset.writer import write_shard
@@ -113,6 +113,26 @@ def test_split_by_hand(folder, tmp_path, make_shard):
     assert [part.rows for part in made.parts.values()] in ([ROWS, 10], [10, ROWS])
     part = next(name for name, told in made.parts.items() if told.names == ("other",))
     assert len(GraspDataset([folder, tmp_path], split=made, part=part)) == 10
+
+
+def test_the_order_of_shards_is_nothing_to_a_split():
+    """Nor is the first object of a set that was held at once."""
+    one = Groups([("b", "a"), ("c", "b")], np.array([3, 4]), {name: name for name in "abc"})
+    other = Groups([("d",)], np.array([5]), {"d": "d"})
+    turned = Groups([("b", "c"), ("a", "b")], np.array([4, 3]), one.names)
+    for seed in range(20):
+        made = [
+            draw_split(shards, by="object", shares={"train": 0.5, "test": 0.5}, seed=seed)
+            for shards in ((one, other), (other, one), (turned, other), (other, turned))
+        ]
+        assert all(split == made[0] for split in made)
+
+
+def test_a_part_is_named_once(folder, tmp_path):
+    asked = ["split", str(folder), "--by", "pose", "-o", str(tmp_path / "s.json"), "--shares", "train=0.8,train=0.2"]
+    result = CliRunner().invoke(app, asked)
+    assert isinstance(result.exception, ConfigError)
+    assert "part 'train' is named twice" in str(result.exception)
 
 
 @pytest.mark.parametrize("shares", ["train=0.5,test=0.6", "train=0.8,val=0.1,test=0.1", "train=4,test=2"])

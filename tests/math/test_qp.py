@@ -53,7 +53,7 @@ def _balance(
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     k = count[i]
     take(arm, normal, i, k, arms, normals)
-    norm_out[i] = balance(arms, normals, k, mu, edges, scale, stop, forces)
+    norm_out[i] = balance(arms, normals, k, mu, edges, scale, stop, 0.0, forces)
     for c in range(k):
         force_out[i, c] = forces[c]
 

@@ -82,9 +82,14 @@ def wait(running: Running, patience: float = LONGEST) -> int:
     try:
         return running.wait(patience)
     except subprocess.TimeoutExpired:
-        with suppress(ProcessLookupError):
-            os.killpg(running.pid, signal.SIGKILL)
+        kill(running)
         raise LgraspError(f"process {running.pid} did not end within {patience:g} s") from None
+
+
+def kill(running: Running) -> None:
+    """End a command, with its session, at once."""
+    with suppress(ProcessLookupError):
+        os.killpg(running.pid, signal.SIGKILL)
 
 
 def catches(process: int, number: int) -> bool:

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from lgrasp.bench.soak.commands import COMMANDS
 from lgrasp.bench.soak.digests import digest, tree
-from lgrasp.bench.soak.processes import LONGEST, WAYS, Launch, catches, processes, start_process, wait
+from lgrasp.bench.soak.processes import LONGEST, WAYS, Launch, Running, catches, kill, processes, start_process, wait
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.hand.find import find_hand
 
@@ -143,27 +143,27 @@ class Soak:
         whole, duration = self.whole(name)
         trial, place = Attack(name, way, moment), self._place(name)
         kernels = set(tree(self._kernels))
-        running = self._launch(place.arguments, place.out, place.environment, place.said)
-        begin = time.monotonic()
-        try:
-            running.wait(moment * duration)
-            self._whole[name] = whole, (duration + time.monotonic() - begin) / 2
-        except subprocess.TimeoutExpired:
-            trial.early = not catches(running.pid, signal.SIGTERM)
+        with self._started(place) as running:
             begin = time.monotonic()
-            with suppress(ProcessLookupError):
-                WAYS[way](running.pid)
-        try:
-            trial.code = wait(running)
-            trial.faults += _words(trial, place.said.read_text(errors="replace"))
-        except LgraspError as error:
-            trial.code, trial.faults = -signal.SIGKILL, [f"still runs: {error}"]
+            try:
+                running.wait(moment * duration)
+                self._whole[name] = whole, (duration + time.monotonic() - begin) / 2
+            except subprocess.TimeoutExpired:
+                trial.early = not catches(running.pid, signal.SIGTERM)
+                begin = time.monotonic()
+                with suppress(ProcessLookupError):
+                    WAYS[way](running.pid)
+            try:
+                trial.code = wait(running)
+                trial.faults += _words(trial, place.said.read_text(errors="replace"))
+            except LgraspError as error:
+                trial.code, trial.faults = -signal.SIGKILL, [f"still runs: {error}"]
         trial.faults += [f"still runs: {line}" for line in place.processes(running.pid, LONGEST)]
         trial.seconds = time.monotonic() - begin
         left = place.digests()
         trial.left_at_once = sorted(left.keys() - whole.keys())
-        running = self._launch(place.arguments, place.out, place.environment, place.said)
-        code = wait(running, _RERUN)
+        with self._started(place) as running:
+            code = wait(running, _RERUN)
         if code and not (COMMANDS[name].once and left == whole):
             trial.faults.append(f"second run: exit code {code}: {place.last_line()}")
         trial.faults += [f"still runs: {line}" for line in place.processes(running.pid, 1.0)]
@@ -196,11 +196,21 @@ class Soak:
         }
         return place
 
+    @contextmanager
+    def _started(self, place: Place) -> Iterator[Running]:
+        """A command that runs, but not on where this process is stopped."""
+        running = self._launch(place.arguments, place.out, place.environment, place.said)
+        try:
+            yield running
+        except BaseException:
+            kill(running)
+            raise
+
     def _finish(self, place: Place) -> float:
         """Run a command to its end; how long it took once it was started [s]."""
-        running = self._launch(place.arguments, place.out, place.environment, place.said)
-        begin = time.monotonic()
-        code = wait(running, _RERUN)
+        with self._started(place) as running:
+            begin = time.monotonic()
+            code = wait(running, _RERUN)
         if code:
             raise LgraspError(f"lgrasp {' '.join(place.arguments)}: exit code {code}: {place.last_line()}")
         return time.monotonic() - begin

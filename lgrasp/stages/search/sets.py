@@ -100,7 +100,7 @@ def _with_friction(points: vec3s, normals: vec3s, k: wp.int32, friction: wp.floa
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     centred(points, k, arms)
-    r = balance(arms, normals, k, friction * INSCRIBED, 0, torque_scale, 0.0, forces)
+    r = balance(arms, normals, k, friction * INSCRIBED, 0, torque_scale, 0.0, 0.0, forces)
     low = float(1.0)
     for i in range(k):
         low = wp.min(low, wp.dot(forces[i], normals[i]))
