@@ -88,6 +88,9 @@ def _joint_limit(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpec, 
 
 def _link_scale(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpec, factor: float) -> HandSpec:
     moving = set(tree.link_names) - set(tree.links_on(0))
+    if sliding := [joint.name for joint in urdf.joints if joint.movable and joint.prismatic and joint.parent in moving]:
+        why = f"joint '{sliding[0]}' slides along a part that moves; there only joints that turn are accepted"
+        raise HandError(f"hand '{spec.name}' cannot be varied by link_scale: {why}")
     for link in robot.findall("link"):
         if link.get("name") not in moving:
             continue

@@ -103,6 +103,19 @@ def test_locked_joints_stay_inside_their_limits(vary, tmp_path):
     assert held.locked_values[0] < 0.4
 
 
+def test_joints_that_slide_along_a_finger_are_refused(tmp_path):
+    """How far they go is no length of a part."""
+    text = fingers(tmp_path, 2).read_text()
+    turns = '<joint name="k0" type="revolute">'
+    assert turns in text
+    (tmp_path / "slides.urdf").write_text(text.replace(turns, turns.replace("revolute", "prismatic")))
+    made = import_urdf(tmp_path / "slides.urdf", name="slides", out=tmp_path / "slides")
+    source = find_hand(str(made.folder))
+    with pytest.raises(HandError, match=r"cannot be varied by link_scale: joint 'k0' slides along a part"):
+        write_variant(source, "link_scale", 2.0, "new", tmp_path / "new")
+    write_variant(source, "joint_limit", 0.5, "new", tmp_path / "new")
+
+
 def test_what_cannot_be_leaves_nothing(tmp_path):
     (tmp_path / "hand.urdf").write_text("<robo/>")
     spec = find_hand("allegro").spec
