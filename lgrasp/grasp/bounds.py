@@ -74,6 +74,12 @@ class GraspBounds(Params):
     min_epsilon: float = Field(
         default=0.0, ge=0, le=1, description="Least Ferrari-Canny quality (metric epsilon); 0 asks for nothing."
     )
+    min_force_share: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.5,
+        description="Least share of the squeeze's normal force on a contact; 0 asks for nothing.",
+    )
     min_hold_probability: float = Field(
         default=0.0,
         ge=0,

@@ -272,7 +272,8 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     """Rows that squeeze the object by less than ``min_squeeze_travel``, or cannot stably with ``min_stable_squeeze``
     (of two contacts: ``min_stable_pinch``), or close by more than ``max_closing_travel``, or through more of the object
     than ``max_closing_penetration`` or farther than ``max_closing_sweep``, or have less than ``min_epsilon``, or a
-    finger that opens by less than ``min_pregrasp_opening``, become none.
+    contact that bears less than ``min_force_share``, or a finger that opens by less than ``min_pregrasp_opening``,
+    become none.
 
     Args:
         row_out: (m,) hand of each row, -1 none.
@@ -283,8 +284,15 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     if row_out[i] < 0:
         return
     contacts = int(0)
+    whole = float(0.0)
+    least = float(1.0e30)
     for c in range(packed.contact_links.shape[1]):
-        contacts += wp.where(packed.contact_links[i, c] >= 0, 1, 0)
+        if packed.contact_links[i, c] >= 0:
+            push = -wp.dot(packed.contact_forces[i, c], packed.contact_normals[i, c])
+            whole += push
+            least = wp.min(least, push)
+            contacts += 1
+    uneven = least < limits.min_force_share * whole
     stable = limits.min_stable_squeeze
     if contacts == PINCH:
         stable = wp.max(stable, limits.min_stable_pinch)
@@ -294,7 +302,7 @@ def drop_limp(limits: Limits, packed: Packed, row_out: wp.array(dtype=wp.int32),
     far = packed.closing_travel[i] > limits.max_closing_travel
     through = packed.closing_penetration[i] > limits.max_closing_penetration
     through = through or packed.closing_sweep[i] > limits.max_closing_sweep
-    if limp or soft or still or far or through or packed.epsilon[i] < limits.min_epsilon:
+    if limp or soft or still or far or through or uneven or packed.epsilon[i] < limits.min_epsilon:
         row_out[i] = -1
         wp.atomic_sub(counts_out, Outcome.KEPT, 1)
         wanted = _stable_share(limits, packed, i) * limits.squeeze_force

@@ -50,7 +50,7 @@ FAILED_BOUNDS = (
     *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
     *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel", "min_stable_squeeze"),
     *("max_closing_travel", "min_epsilon", "min_pregrasp_opening", "min_hold_probability"),
-    *("max_closing_penetration", "max_closing_sweep"),
+    *("max_closing_penetration", "max_closing_sweep", "min_force_share"),
 )
 """By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
 way of the open hand to the object clears the table."""
@@ -78,14 +78,14 @@ METRICS = (
 
 _SQUEEZE_BOUNDS = (
     *("min_squeeze_travel", "max_closing_travel", "min_stable_squeeze", "min_epsilon", "min_pregrasp_opening"),
-    *("max_closing_penetration", "max_closing_sweep"),
+    *("max_closing_penetration", "max_closing_sweep", "min_force_share"),
 )
 
 
 def bounds_squeeze(bounds: Any) -> bool:
     """Whether one of _SQUEEZE_BOUNDS asks for something; ``bounds`` as of :func:`failed_squeeze`."""
     least = [bounds.min_squeeze_travel, bounds.min_epsilon, bounds.min_pregrasp_opening]
-    least += [bounds.min_stable_squeeze, bounds.min_stable_pinch]
+    least += [bounds.min_stable_squeeze, bounds.min_stable_pinch, bounds.min_force_share]
     through = bounds.max_closing_penetration < ANY_PENETRATION or bounds.max_closing_sweep < ANY_SWEEP
     return max(least) > 0 or bounds.max_closing_travel < ANY_CLOSING or through
 
@@ -93,7 +93,10 @@ def bounds_squeeze(bounds: Any) -> bool:
 def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
     """Which of n rows fail each of _SQUEEZE_BOUNDS (GraspBounds, or the same numbers on a device), (n,) bool, in its
     order."""
-    pinch = (table.contact_links >= 0).sum(1) == int(PINCH)
+    touching = table.contact_links >= 0
+    pinch = touching.sum(1) == int(PINCH)
+    push = -(table.contact_forces * table.contact_normals).sum(-1)
+    least = np.where(touching, push, np.inf).min(1, initial=np.inf)
     return [
         table.metrics["squeeze_travel"] < bounds.min_squeeze_travel,
         table.metrics["closing_travel"] > bounds.max_closing_travel,
@@ -103,6 +106,7 @@ def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
         table.metrics["pregrasp_opening"] < bounds.min_pregrasp_opening,
         table.metrics["closing_penetration"] > bounds.max_closing_penetration,
         table.metrics["closing_sweep"] > bounds.max_closing_sweep,
+        least < bounds.min_force_share * np.where(touching, push, 0.0).sum(1),
     ]
 
 

@@ -34,9 +34,10 @@ def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
         if 2 * found.get("squeeze", 0) > whole:
             reason = (
                 "the joints hardly press on the object, push it out, close from far away or through it, or cannot "
-                "open, or epsilon is small; bounds.min_squeeze_travel=0, bounds.min_stable_squeeze=0, "
-                "bounds.min_stable_pinch=0, bounds.max_closing_travel=10, bounds.max_closing_penetration=0.03, "
-                "bounds.max_closing_sweep=1, bounds.min_pregrasp_opening=0 and bounds.min_epsilon=0 ask for nothing"
+                "open, a contact bears next to nothing, or epsilon is small; bounds.min_squeeze_travel=0, "
+                "bounds.min_stable_squeeze=0, bounds.min_stable_pinch=0, bounds.max_closing_travel=10, "
+                "bounds.max_closing_penetration=0.03, bounds.max_closing_sweep=1, bounds.min_pregrasp_opening=0, "
+                "bounds.min_force_share=0 and bounds.min_epsilon=0 ask for nothing"
             )
         if 2 * found.get("weak", 0) > whole:
             reason = (

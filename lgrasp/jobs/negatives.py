@@ -26,6 +26,7 @@ _LOOSE: dict[str, float] = {
     "max_gswo": 0.5,
     "max_unresisted_load": 1.0,
     "min_epsilon": 0.0,
+    "min_force_share": 0.0,
     "min_squeeze_travel": 0.0,
     "min_stable_squeeze": 0.0,
     "min_stable_pinch": 0.0,

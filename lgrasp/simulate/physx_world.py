@@ -142,7 +142,10 @@ class PhysxWorld(World):
                 self._component[body].add_force_torque(*load)
             if self._coupled:
                 self._tie()
+            if self._ran_away:
+                return  # contacts of what is nowhere would end the process
             self._system.step()
+            self._ran_away = not np.isfinite(self._speeds()).all()
 
     def _tie(self) -> None:
         """Aim the joints of each drive at where the drive wants them and, far more stiffly, at where they are on the
@@ -198,8 +201,11 @@ class PhysxWorld(World):
         return max([0.0, *(-apart for pair, apart in self._contacts() if own & {*pair})])
 
     def wild(self) -> bool:
-        speed = np.concatenate([self.velocities().ravel(), self._hand.get_qvel()])
-        return not np.abs(speed).max() < WILD
+        return not np.abs(self._speeds()).max() < WILD
+
+    def _speeds(self) -> np.ndarray:
+        """Of the objects and the joints."""
+        return np.concatenate([self.velocities().ravel(), self._hand.get_qvel()])
 
     def _contacts(self) -> list[tuple[list[int], float]]:
         """Both bodies of each contact, and how far they are apart [m]."""
@@ -245,6 +251,7 @@ class PhysxWorld(World):
         self._before: np.ndarray | None = None  # positions of the joints a step ago
         self._couple(row)
         self._loads: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._ran_away = False
 
     def _ignore_groups(self) -> np.ndarray:
         """A bit for each pair of bodies that must not collide (B,), but for neighbours, which PhysX leaves out."""

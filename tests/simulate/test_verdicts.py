@@ -112,7 +112,7 @@ def test_rows_stand_alone(jaws: Jaws, fc):
 
 
 def test_frame_of_the_object_does_not_matter(jaws: Jaws, fc):
-    shard = jaws.shard(press(1.0))
+    shard = jaws.shard(press(2.0))
     shift = np.array([30.0, -20.0, 10.0], "f4")  # as of scans in the coordinates of a room
     cube = shard.objects[0]
     moved = replace(shard, objects=[replace(cube, vertices=cube.vertices + shift)])

@@ -11,7 +11,7 @@ from support.wrench import residual
 from lgrasp.engine.batch import run_stages
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import check_grasps, known_contacts
-from lgrasp.grasp.outcomes import REASONS
+from lgrasp.grasp.outcomes import REASONS, Outcome
 from lgrasp.grasp.stability_kernels import CONTACT_STIFFNESS, MOST_SQUEEZE
 from lgrasp.grasp.tables import ContactSets
 from lgrasp.stages.filter.stage import run
@@ -263,6 +263,30 @@ def test_pinches_must_squeeze_more_stably_where_asked(context, swift):
     kept = ~pinch | (stable >= np.float32(least))
     assert 5 < (~kept).sum() < pinch.sum()
     np.testing.assert_array_equal(free.q[kept], bound.q)
+
+
+def test_every_contact_bears_a_share_where_asked(tables, context, swift):
+    """Forces are shared evenly where they balance so; what is left below a share is dropped."""
+    params, bounds = swift.params("filter"), context.bounds
+    free = run(tables.search, params, context)[0]
+    touching = free.contact_links >= 0
+    push = np.where(touching, -(free.contact_forces * free.contact_normals).sum(-1), np.nan)
+    share = np.nanmin(push, 1) / np.nansum(push, 1)
+    assert np.mean(share * touching.sum(1) > 0.29) > 0.3
+    asked = replace(context, bounds=bounds.changed(min_force_share=0.12))
+    bound = run(tables.search, params, asked)
+    kept = share >= np.float32(0.12)
+    assert bound[1]["squeeze"] == (~kept).sum() > 10
+    np.testing.assert_array_equal(free.q[kept], bound[0].q)
+    _, outcome = check_grasps(
+        asked.hand,
+        asked.object,
+        free.pose,
+        free.q,
+        known_contacts(free.contact_links, free.contact_points, free.contact_normals, context.device),
+        asked.bounds,
+    )
+    assert ((outcome == Outcome.KEPT) == kept).mean() > 0.98
 
 
 def test_grasps_that_close_from_far_away_are_dropped_where_asked(tables, context, swift):
