@@ -8,7 +8,7 @@ from lgrasp.math.constants import BALANCED, CONE_EDGES
 from lgrasp.math.frictionless import centroid
 from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.math.loads import unresisted
-from lgrasp.math.qp import balance
+from lgrasp.math.qp import NO_LIMIT, balance
 from lgrasp.math.quality import epsilon_bound
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
@@ -42,6 +42,7 @@ def _balanced(
     edges: wp.int32,
     torque_scale: wp.float32,
     stop: wp.float32,
+    limit: wp.float32,
     least: wp.float32,
     forces: vec3s,
 ):
@@ -50,7 +51,7 @@ def _balanced(
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     for c in range(k):
         arms[c] = points[c] - middle
-    return balance(arms, normals, k, friction, edges, torque_scale, stop, least, forces)
+    return balance(arms, normals, k, friction, edges, torque_scale, stop, limit, least, forces)
 
 
 @wp.kernel
@@ -69,8 +70,9 @@ def balance_grasps(limits: Limits, places: Places, at: CheckedPostures, found_ou
         found_out.fswo[i] = 1.0
         found_out.gswo[i] = 1.0
         return
-    found_out.fswo[i] = _balanced(points, normals, k, 0.0, 0, limits.torque_scale, 0.0, 0.0, forces)
-    gswo = _balanced(points, normals, k, limits.friction, CONE_EDGES, limits.torque_scale, BALANCED, 0.0, forces)
+    found_out.fswo[i] = _balanced(points, normals, k, 0.0, 0, limits.torque_scale, 0.0, NO_LIMIT, 0.0, forces)
+    scale = limits.torque_scale
+    gswo = _balanced(points, normals, k, limits.friction, CONE_EDGES, scale, BALANCED, NO_LIMIT, 0.0, forces)
     found_out.gswo[i] = gswo
     if gswo > limits.max_gswo:
         if found_out.outcome[i] == Outcome.KEPT:
@@ -172,7 +174,7 @@ def center_forces(
             cone = attempt - 2 * _CONES
             least = 0.0
         mu = limits.friction * float(cone + 1) / float(_CONES)
-        if _balanced(points, normals, k, mu, 0, limits.torque_scale, enough, least, forces) <= goal:
+        if _balanced(points, normals, k, mu, 0, limits.torque_scale, enough, goal, least, forces) <= goal:
             for c in range(k):
                 found_out.force[s, c] = forces[c]
             break

@@ -15,7 +15,8 @@ wp.set_module_options(KERNEL_OPTIONS)
 
 _MAX_CORRAL = 8
 _EXACT = wp.constant(1.0e-4)  # relative error of squared norms
-_NO_LIMIT = wp.constant(1.0e15)
+NO_LIMIT = wp.constant(1.0e15)
+"""Norm that no wrench reaches."""
 
 vec6 = wp.types.vector(6, wp.float32)
 vec8 = wp.types.vector(_MAX_CORRAL, wp.float32)
@@ -221,6 +222,7 @@ def balance(
     edges: wp.int32,
     torque_scale: wp.float32,
     stop: wp.float32,
+    limit: wp.float32,
     least: wp.float32,
     forces: vec3s,
 ):
@@ -230,16 +232,17 @@ def balance(
         arms, normals: local arrays; contact i acts at ``arms[i]`` [m] along unit inward normal ``normals[i]``.
         k: number of contacts. mu: friction coefficient. edges: cone edges, 0 for the round cone.
         stop: return as soon as the norm is below this.
+        limit: return as soon as it is known to be above this (NO_LIMIT: find it).
         least: force along its normal that every contact bears, below 1 / k; the cones are of what comes on top.
         forces: (local, MAX_CONTACTS) receives the optimal forces.
 
     Returns:
-        The least norm.
+        The least norm, or one above ``limit``.
     """
     p = _balancing(mu, torque_scale)
     p.edges = edges
     p.stop = stop
-    p.limit = _NO_LIMIT
+    p.limit = limit
     p.total = 1.0 - least * float(k)
     for i in range(k):
         p.load += wrench(arms[i], normals[i] * least, torque_scale)

@@ -11,7 +11,7 @@ from support.wrench import cone_forces, is_balanced, residual, unresisted
 from lgrasp.math import loads
 from lgrasp.math.frictionless import frictionless
 from lgrasp.math.limits import MAX_CONTACTS
-from lgrasp.math.qp import balance, balances
+from lgrasp.math.qp import NO_LIMIT, balance, balances
 from lgrasp.math.transforms import vec3s
 from lgrasp.runtime.device import KERNEL_OPTIONS
 
@@ -53,7 +53,7 @@ def _balance(
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     k = count[i]
     take(arm, normal, i, k, arms, normals)
-    norm_out[i] = balance(arms, normals, k, mu, edges, scale, stop, 0.0, forces)
+    norm_out[i] = balance(arms, normals, k, mu, edges, scale, stop, NO_LIMIT, 0.0, forces)
     for c in range(k):
         force_out[i, c] = forces[c]
 

@@ -6,7 +6,7 @@ from lgrasp.grasp.structs import Candidates
 from lgrasp.math.constants import INSCRIBED
 from lgrasp.math.frictionless import centroid, frictionless
 from lgrasp.math.limits import MAX_CONTACTS, MAX_GROUPS
-from lgrasp.math.qp import balance
+from lgrasp.math.qp import NO_LIMIT, balance
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -100,7 +100,7 @@ def _with_friction(points: vec3s, normals: vec3s, k: wp.int32, friction: wp.floa
     arms = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     forces = wp.zeros(shape=(MAX_CONTACTS,), dtype=wp.vec3)
     centred(points, k, arms)
-    r = balance(arms, normals, k, friction * INSCRIBED, 0, torque_scale, 0.0, 0.0, forces)
+    r = balance(arms, normals, k, friction * INSCRIBED, 0, torque_scale, 0.0, NO_LIMIT, 0.0, forces)
     low = float(1.0)
     for i in range(k):
         low = wp.min(low, wp.dot(forces[i], normals[i]))
