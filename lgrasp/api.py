@@ -5,7 +5,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from numbers import Real
-from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +30,7 @@ from lgrasp.hand.model import HandModel
 from lgrasp.jobs.listing import list_hands, list_objects, list_pipelines
 from lgrasp.jobs.shard_inputs import named_hand, named_object
 from lgrasp.object.model import ObjectModel
+from lgrasp.paths import as_name
 from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate.protocol import Protocol, find_protocol
 
@@ -166,7 +166,7 @@ def generate(
     if not isinstance(steer or {}, Mapping):
         raise ConfigError(f"steer is a {type(steer).__name__}; accepted is such as {{'fingers': 'thumb,index'}}")
     what["pipeline"] = what["pipeline"].with_steering(**{str(name): value for name, value in (steer or {}).items()})
-    return _done(GenerateJob, out, n, object=_named(object, "object"), scale=scale, negatives=negatives, **what)
+    return _done(GenerateJob, out, n, object=as_name(object, "object"), scale=scale, negatives=negatives, **what)
 
 
 def sequence(
@@ -195,7 +195,7 @@ def sequence(
 
     what = _asked(hand, n, pipeline, seed, device, workers)
     names = [objects] if isinstance(objects, str) or not isinstance(objects, Iterable) else objects
-    return _done(SequenceJob, out, objects=tuple(_named(name, "object") for name in names), scale=str(scale), **what)
+    return _done(SequenceJob, out, objects=tuple(as_name(name, "object") for name in names), scale=str(scale), **what)
 
 
 def plan(
@@ -220,12 +220,12 @@ def plan(
     """
     from lgrasp.jobs.refine.plan import PlanJob
 
-    given = object if isinstance(object, Cloud) else _named(object, "object")
+    given = object if isinstance(object, Cloud) else as_name(object, "object")
     points = isinstance(given, Cloud) or Path(given).suffix.lower() in POINT_SUFFIXES
     what: dict[str, Any] = {"cloud" if points else "object": given}
     what |= {} if isinstance(object, Cloud) else {"scale": scale}
-    what["model"] = None if model is None else _named(model, "model")
-    return _done(PlanJob, out, hand=_named(hand, "hand"), starts=starts, device=device, **what)
+    what["model"] = None if model is None else as_name(model, "model")
+    return _done(PlanJob, out, hand=as_name(hand, "hand"), starts=starts, device=device, **what)
 
 
 def refine(
@@ -295,7 +295,7 @@ def open(path: Name) -> Grasps:
     Raises:
         LgraspError: no shard there, one that is damaged, or shards of several hands, objects or runs.
     """
-    found = find_shards([Path(_named(path, "path", "a shard or a folder of shards"))])
+    found = find_shards([Path(as_name(path, "path", "a shard or a folder of shards"))])
     return _made(found, nothing=f"{path}: no grasp in it")
 
 
@@ -325,7 +325,7 @@ def load_hand(name: Name, device: "DeviceName" = "cpu") -> Hand:
     Raises:
         LgraspError: there is no such hand, or it cannot be used.
     """
-    return named_hand(Cache(), _named(name, "name"), resolve_device(str(device)))[1]
+    return named_hand(Cache(), as_name(name, "name"), resolve_device(str(device)))[1]
 
 
 def load_object(name: Name, scale: float = 1.0, device: "DeviceName" = "cpu") -> Object:
@@ -334,7 +334,7 @@ def load_object(name: Name, scale: float = 1.0, device: "DeviceName" = "cpu") ->
     Raises:
         LgraspError: there is no such object, or it cannot be used.
     """
-    return named_object(Cache(), _named(name, "name"), scale, resolve_device(str(device)))
+    return named_object(Cache(), as_name(name, "name"), scale, resolve_device(str(device)))
 
 
 def hands() -> dict[str, str]:
@@ -352,13 +352,6 @@ def pipelines() -> dict[str, str]:
     return {entry["name"]: entry["description"] for entry in list_pipelines()}
 
 
-def _named(value: Name, what: str, accepted: str = "a name or the path of a file") -> str:
-    """A name or path; ConfigError if it is something else, such as what was loaded by that name."""
-    if not isinstance(value, str | PathLike):
-        raise ConfigError(f"{what} is a {type(value).__name__}; {accepted} is accepted")
-    return fspath(value)
-
-
 def _asked(
     hand: Name,
     n: int,
@@ -371,7 +364,7 @@ def _asked(
     if not isinstance(n, Real) or isinstance(n, bool):
         raise ConfigError(f"n is {n!r}; a whole number is accepted")
     chosen = pipeline if isinstance(pipeline, Pipeline) else load_pipeline(pipeline)
-    what: dict[str, Any] = {"hand": _named(hand, "hand"), "rows": n, "pipeline": chosen.with_seed(seed)}
+    what: dict[str, Any] = {"hand": as_name(hand, "hand"), "rows": n, "pipeline": chosen.with_seed(seed)}
     return what | {"device": device, "workers": workers}
 
 
@@ -379,7 +372,7 @@ def _asked(
 def _folder(out: Name | None) -> Iterator[Path]:
     """A folder for files that stay, or one that goes."""
     if out is not None:
-        yield Path(_named(out, "out", "the path of a folder"))
+        yield Path(as_name(out, "out", "the path of a folder"))
         return
     with temporary_folder() as folder:
         yield folder / "shards"
@@ -389,7 +382,7 @@ def _folder(out: Name | None) -> Iterator[Path]:
 def _files(grasps: Grasps | Name) -> Iterator[tuple[Path, ...]]:
     """Shards or folders of them that hold grasps."""
     if not isinstance(grasps, Grasps):
-        yield (Path(_named(grasps, "grasps", "grasps, a shard, or a folder of shards")),)
+        yield (Path(as_name(grasps, "grasps", "grasps, a shard, or a folder of shards")),)
         return
     if not len(grasps):
         raise ConfigError("0 grasps are given; at least one is needed")

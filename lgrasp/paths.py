@@ -7,7 +7,7 @@ from pathlib import Path
 
 import platformdirs
 
-from lgrasp.errors import LgraspError
+from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.notices import notice
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -87,6 +87,13 @@ def check_input(path: Path, suffixes: Sequence[str], what: str, error: type[Lgra
         raise error(f"{path}: {problem}; {what} ({', '.join(suffixes)}) is accepted")
     if path.suffix.lower() not in suffixes:
         raise error(f"{path}: suffix '{path.suffix}' is unknown; accepted are {', '.join(suffixes)}")
+
+
+def as_name(value: str | os.PathLike[str], what: str, accepted: str = "a name or the path of a file") -> str:
+    """A name or path; ConfigError if it is something else, such as what was loaded by that name."""
+    if not isinstance(value, str | os.PathLike):
+        raise ConfigError(f"{what} is a {type(value).__name__}; {accepted} is accepted")
+    return os.fspath(value)
 
 
 def name_problem(name: str) -> str:

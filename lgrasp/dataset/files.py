@@ -83,7 +83,7 @@ def shards_below(paths: Paths, leave_out: Path | None = None) -> list[tuple[Path
 
 def folders_below(paths: Paths, *, deep: bool = True) -> list[Path]:
     """The folders among some paths, and, of any depth, those below them that hold shards."""
-    tops = [path for path in _given(paths) if path.is_dir()]
+    tops = [path for path in given_paths(paths) if path.is_dir()]
     return list(dict.fromkeys(f for t in tops for f in (t, *sorted({s.parent for s in _inside(t, deep=deep)}))))
 
 
@@ -115,7 +115,7 @@ def _inside(folder: Path, *, deep: bool) -> list[Path]:
 
 def named_files(paths: Paths) -> list[Path]:
     """Those of some paths that are no folders."""
-    return [path for path in _given(paths) if not path.is_dir()]
+    return [path for path in given_paths(paths) if not path.is_dir()]
 
 
 def places(paths: Iterable[Path]) -> list[str]:
@@ -125,7 +125,8 @@ def places(paths: Iterable[Path]) -> list[str]:
     return [str(file.relative_to(top)) for file in files]
 
 
-def _given(paths: Paths) -> list[Path]:
+def given_paths(paths: Paths) -> list[Path]:
+    """One path or several as a list."""
     return [Path(paths)] if isinstance(paths, str | os.PathLike) else [Path(p) for p in paths]
 
 
@@ -133,7 +134,7 @@ def _found(
     paths: Paths, leave_out: Path | None = None, *, deep: bool = True, what: str = "shard"
 ) -> list[tuple[Path, Path]]:
     """Shard files with the folders that were named; with its own for a file that was named."""
-    given = _given(paths)
+    given = given_paths(paths)
     found: list[tuple[Path, Path]] = []
     for path in given:
         if not path.exists():

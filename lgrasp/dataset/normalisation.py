@@ -1,6 +1,5 @@
 """Means and deviations that bring grasps to one scale for a network, measured once."""
 
-import os
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -8,7 +7,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from lgrasp.dataset.files import Paths
+from lgrasp.dataset.files import Paths, given_paths
 from lgrasp.dataset.json_file import JsonFile
 from lgrasp.dataset.split import Split
 from lgrasp.dataset.torch_stream import GraspIterableDataset
@@ -65,8 +64,7 @@ class Normalisation(JsonFile):
             sums, squares = sums + (vectors - shift).sum(0), squares + ((vectors - shift) ** 2).sum(0)
             rows += len(vectors)
         if not rows:
-            places = [str(path) for path in ([paths] if isinstance(paths, str | os.PathLike) else paths)]
-            raise ConfigError(f"{listed(places, 3)}: no rows to measure")
+            raise ConfigError(f"{listed([str(path) for path in given_paths(paths)], 3)}: no rows to measure")
         mean = sums / rows
         std = np.sqrt(np.maximum(squares / rows - mean**2, 0))
         names = (*("x", "y", "z"), *(f"R{i}{j}" for j in (0, 1) for i in range(3)), *hand.joint_names)

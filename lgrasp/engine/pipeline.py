@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from importlib import import_module
 from numbers import Integral
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.params import LISTED, HandParams
 from lgrasp.notices import notice
 from lgrasp.object.params import ObjectParams
-from lgrasp.paths import name_problem
+from lgrasp.paths import as_name, name_problem
 from lgrasp.stages.migration import ALIASES, move_to_bounds, stage_name
 from lgrasp.steer.params import NOTHING, Steering
 
@@ -270,9 +270,7 @@ def load_pipeline(name: str | PathLike[str]) -> Pipeline:
     Raises:
         ConfigError: no such pipeline, or a wrong key or value in it.
     """
-    if not isinstance(name, str | PathLike):
-        raise ConfigError(f"pipeline is a {type(name).__name__}; a name or the path of a file is accepted")
-    name, files = fspath(name), pipeline_files()
+    name, files = as_name(name, "pipeline"), pipeline_files()
     if name in ALIASES and name not in files:
         notice(f"pipeline '{name}' is now called '{ALIASES[name]}'; the old name works in this release only")
         name = ALIASES[name]

@@ -86,10 +86,8 @@ _WRITTEN: dict[str, Path] = {}  # URDFs by the content of their hands
 
 def _written(record: HandRecord) -> Path:
     """The URDF of a hand as a file, written once while the process lives."""
-    content = hashlib.sha256(repr((record.name, record.urdf, sorted(record.meshes))).encode())
-    for name in sorted(record.meshes):
-        content.update(hashlib.sha256(record.meshes[name]).digest())
-    key = content.hexdigest()
+    meshes = {name: hashlib.sha256(data).hexdigest() for name, data in record.meshes.items()}
+    key = content_key("hand files", 1, name=record.name, urdf=record.urdf, meshes=meshes)
     if key not in _WRITTEN or not _WRITTEN[key].exists():
         _WRITTEN[key] = write_hand(record, scratch_folder())
     return _WRITTEN[key]

@@ -143,8 +143,9 @@ class RowChecks:
     def _joints(self) -> dict[str, np.ndarray]:
         """Limits, mimic relations and couplings, of the open hand too; values of all joints at the grasp."""
         own, driven, relation = (np.zeros(len(self.good)) for _ in range(3))
-        for posture in [name for name in ("q", "q_pregrasp") if name in self.g]:
-            stored, full = self._values(posture), self._full(posture)
+        postures = {name: self._full(name) for name in ("q", "q_pregrasp") if name in self.g}
+        for posture, full in postures.items():
+            stored = self._values(posture)
             for name, j in self.hand.movable.items():
                 excess = np.maximum(np.maximum(j.lower - full[name], full[name] - j.upper), 0.0)
                 if j.mimic is None:
@@ -157,7 +158,7 @@ class RowChecks:
         self._set("limits", own)
         self._set("mimic_limits", driven)
         self._set("mimic", relation)
-        return self._full("q")
+        return postures["q"]
 
     def _values(self, posture: str) -> dict[str, np.ndarray]:
         return dict(zip(self.shard.joint_names, np.asarray(self.g[posture], float)[self.good].T, strict=True))

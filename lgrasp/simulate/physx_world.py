@@ -138,12 +138,12 @@ class PhysxWorld(World):
     @_recorded
     def step(self, steps: int) -> None:
         for _ in range(steps):
+            if self._ran_away:
+                return  # contacts of what is nowhere would end the process
             for body, load in self._loads.items():
                 self._component[body].add_force_torque(*load)
             if self._coupled:
                 self._tie()
-            if self._ran_away:
-                return  # contacts of what is nowhere would end the process
             self._system.step()
             self._ran_away = not np.isfinite(self._speeds()).all()
 
@@ -177,7 +177,7 @@ class PhysxWorld(World):
         return tuple(self._past)
 
     def restore(self, state: Any) -> None:
-        """Do it again: of the contacts that it remembers from step to step PhysX gives no copy."""
+        """Do it again: of the friction that it remembers from step to step PhysX gives no copy."""
         for act, args in state:
             act(self, *args)
 
