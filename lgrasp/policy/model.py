@@ -22,7 +22,7 @@ MOST_HITS = 8
 POINTS = 32
 """Points of the hand's reach where it is told how far the object is."""
 LEAST_PROPOSALS, MOST_PROPOSALS = 16, 64
-"""Poses of a candidate that a policy rates: where grasps are common, where they are rare."""
+"""Poses of a candidate that a policy rates, as a training proposes them: where grasps are common, where they are rare."""
 _FORMAT, _VERSION = "lgrasp-pose-policy", 1
 
 
@@ -87,7 +87,7 @@ def read_policy(path: str | Path) -> PosePolicy:
         if not all(0 < worth <= 1 for worth in sources.values()):
             raise ValueError(f"factors of sources {sources}")
         proposals = int(about.pop("proposals", LEAST_PROPOSALS))
-        if not LEAST_PROPOSALS <= proposals <= MOST_PROPOSALS:
+        if not 1 <= proposals <= MOST_PROPOSALS:
             raise ValueError(f"{proposals} proposals")
         made = PosePolicy(
             about.pop("hand"),
