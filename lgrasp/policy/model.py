@@ -22,7 +22,7 @@ MOST_HITS = 8
 POINTS = 32
 """Points of the hand's reach where it is told how far the object is."""
 LEAST_PROPOSALS, MOST_PROPOSALS = 16, 64
-"""Poses of a candidate that a policy rates, as a training proposes them: where grasps are common, where they are rare."""
+"""Poses of a candidate that a policy rates, as training proposes: few where grasps are common, many where rare."""
 _FORMAT, _VERSION = "lgrasp-pose-policy", 1
 
 
