@@ -110,15 +110,19 @@ def failed_squeeze(table: GraspTable, bounds: Any) -> list[np.ndarray]:
     ]
 
 
-def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds) -> np.ndarray:
-    """Codes of FAILED_BOUNDS of checked rows with their outcomes, (n,) float32; 0 of rows that pass."""
-    few = (table.contact_links >= 0).sum(1) < bounds.min_contacts
+def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds, link_groups: np.ndarray) -> np.ndarray:
+    """Codes of FAILED_BOUNDS of checked rows with their outcomes, (n,) float32; 0 of rows that pass.
+
+    Args:
+        link_groups: group of each link, -1 of static ones, (L,): contacts of one group alone are too few.
+    """
+    touching, group = table.contact_links >= 0, link_groups[table.contact_links]
+    one = np.where(touching, group, -1).max(1, initial=-1) <= np.where(touching, group, len(link_groups)).min(1)
+    few = one | (touching.sum(1) < bounds.min_contacts)
     wide = table.metrics["gap"] > bounds.max_gap
-    steep = table.metrics["normal_error"] > np.radians(bounds.max_normal_angle)
     at = {name: code for code, name in enumerate(FAILED_BOUNDS)}
-    # what fails no bound by itself has its contacts on one finger
-    found = at["min_contacts"], at["max_gap"], at["max_normal_angle"]
-    contact = np.select([few, wide, steep], found, at["min_contacts"])
+    # normals are bounded beside an edge as well, which normal_error does not tell
+    contact = np.select([few, wide], [at["min_contacts"], at["max_gap"]], at["max_normal_angle"])
     codes = np.zeros(max(Outcome) + 1, np.float32)
     for failed, name in _FAILED.items():
         codes[failed] = at[name]

@@ -142,6 +142,11 @@ class Tree:
         """Group that a link belongs to, -1 for static ones."""
         return int(self.body_group[self.body_of(link)])
 
+    @property
+    def link_groups(self) -> np.ndarray:
+        """(L,) i32: group of each link, -1 for static ones."""
+        return self.body_group[self.link_body]
+
     def surface_of(self, link: str) -> int:
         """Group of a link among contact surfaces: that of static links comes last."""
         return self.group_of(link) % (self.groups + 1)

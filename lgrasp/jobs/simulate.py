@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.reader import ShardReader
+from lgrasp.dataset.reader import ShardReader, count_rows
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import rows_digest
@@ -166,7 +166,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
                     for n in COLUMNS | OBJECT_COLUMNS | DRAWN_COLUMNS | LIFT_COLUMNS
                     if prefix + n in reader.columns
                 },
-                seconds=seconds,
+                seconds=seconds * len(reader) / max(count_rows(path), 1),  # those of all rows
             )
 
     def _kind(self) -> str:
@@ -215,7 +215,8 @@ def summary(done: Sequence[Simulated], protocol: Protocol) -> list[dict[str, Any
         sets, which = np.unique(one.object_index, axis=0, return_inverse=True)
         for number in np.lexsort([*sets.T[::-1], (sets >= 0).sum(1)]):
             part = _part(one, which.ravel() == number)
-            alike = one.hand, *((solid.name, solid.volume) for solid in part.objects)
+            # rows of one object may come with others that have several: these have columns of their own
+            alike = one.hand, frozenset(part.columns), *((solid.name, solid.volume) for solid in part.objects)
             groups.setdefault(alike, []).append(part)
     return [_entry(group, protocol) for group in groups.values()]
 

@@ -119,7 +119,8 @@ class Planner:
                 passed = outcome == Outcome.KEPT
                 table.metrics["valid"] = passed.astype(np.float32)
                 if keep_invalid:
-                    table.metrics["failed_bound"] = failed_bounds(table, outcome, self.effort.bounds)
+                    links = self.hand.model.tree.link_groups
+                    table.metrics["failed_bound"] = failed_bounds(table, outcome, self.effort.bounds, links)
                 tables.append(take_grasps(table, np.flatnonzero(passed | keep_invalid)))
                 if progress:
                     progress(counts["starts"], counts["kept"])

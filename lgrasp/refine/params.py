@@ -26,7 +26,7 @@ MatchingRounds = Annotated[int, Field(ge=0, le=1000, description="Number of time
 TranslationStep = Annotated[float, Field(gt=0, le=0.1, description="Largest translation of the hand in one step.")]
 RotationStep = Annotated[float, Field(gt=0, le=1, description="Largest rotation of the hand in one step.")]
 JointStep = Annotated[float, Field(gt=0, le=1, description="Largest motion of a joint in one step.")]
-EndReach = Annotated[float, Field(gt=0, le=1, description="The same at the last matching.")]
+EndReach = Annotated[float, Field(gt=0, le=1, description="What it falls towards, one matching after the last.")]
 PointsWeight = Annotated[
     float, Field(ge=0, le=1e6, description="Weight of point-to-plane distances, per 1 cm squared.")
 ]
@@ -53,7 +53,7 @@ class LocalSearch(Params):
     max_translation_step: TranslationStep = 0.0015
     max_rotation_step: RotationStep = 0.015
     max_joint_step: JointStep = 0.02
-    decay: float = Field(default=0.05, gt=0, le=1, description="Size of the last step over that of the first.")
+    decay: float = Field(default=0.05, gt=0, le=1, description="Size of a step after the last over that of the first.")
     reach: float = Field(
         default=0.02, gt=0, le=1, description="Points farther from the object do not pull, first matching."
     )

@@ -14,7 +14,7 @@ from lgrasp.grasp.records import GraspRows
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.slip import points_on_links, slips
 from lgrasp.simulate.trial import Trial
-from lgrasp.simulate.verdict import AXES, CHUNK, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude
+from lgrasp.simulate.verdict import AXES, Bounds, Closed, Look, Pulls, Verdict, at_rest, conclude
 from lgrasp.simulate.worlds import Kept, Placed, Sighting, Worlds
 
 _SHARES = (4.0, 2.0, 1.0, 0.5, 0.25, 0.0625)
@@ -157,8 +157,8 @@ class WorldTrials:
                 hands.contacts = self._touching_at_rest(hands, a)
             sim.drive(a, b)
             seconds = self._protocol.phase + (self._protocol.rest if b is stops[-1] else 0.0)
-            for _ in range(max(1, round(seconds / CHUNK))):
-                sim.advance()
+            for steps in sim.chunks(seconds):
+                sim.advance(steps)
                 hands.now = now = sim.look()
                 hands.worst = np.maximum(hands.worst, sim.moved(now.qpos, home)[:n])
                 hands.wild |= now.wild[:n]
@@ -172,8 +172,8 @@ class WorldTrials:
         n, sim = len(hands.full), self._sim
         before = sim.keep()
         sim.drive(targets, targets)
-        for _ in range(max(1, round(self._protocol.settle / CHUNK))):
-            sim.advance()
+        for steps in sim.chunks(self._protocol.settle):
+            sim.advance(steps)
         links, _, full = sim.touching()
         hands.full |= full[:n]
         sim.take(before, np.arange(sim.worlds))
@@ -191,7 +191,8 @@ class WorldTrials:
         enough = sum(sim.worlds >= len(waiting) for sim in self._pulled)
         smaller = self._pulled[max(enough - 1, 0) :][::-1]
         sim = smaller.pop()
-        total = max(1, math.ceil(self._protocol.hold / CHUNK - 1e-6))
+        steps = sim.steps(self._protocol.hold)
+        total = math.ceil(steps / sim.chunk)  # all whole: worlds are at different ones
         job: np.ndarray = np.full((sim.worlds, 2), -1)  # grasp and direction of each world
         done, depth = np.zeros(sim.worlds, int), np.zeros(sim.worlds)
         before, worst = np.zeros((2, sim.worlds, objects, 2))
@@ -221,7 +222,9 @@ class WorldTrials:
             if not len(waiting) and len(busy) <= _FEW_PER_THREAD * len(self._spare):
                 so_far = [Closed(0, np.nan, False, worst[w], depth[w]) for w in busy]
                 i, k = job[busy].T
-                wild_pulls[i, k] = self._end_here(sim, busy, job[busy], total - done[busy], home[busy], so_far, pulls)
+                wild_pulls[i, k] = self._end_here(
+                    sim, busy, job[busy], steps - done[busy] * sim.chunk, home[busy], so_far, pulls
+                )
                 job[busy] = -1
                 continue
             while not len(waiting) and smaller and len(busy) <= smaller[-1].worlds:
@@ -231,7 +234,7 @@ class WorldTrials:
                 job, done, depth, before, worst, home = (a[rows] for a in (job, done, depth, before, worst, home))
                 job[len(busy) :] = -1
                 busy = np.arange(len(busy))
-            sim.advance()
+            sim.advance(sim.chunk)
             now = sim.look()
             here, wild, touches = sim.moved(now.qpos, home), now.wild, now.links > 0
             worst, depth = np.maximum(worst, here), np.where(wild, depth, np.maximum(depth, now.depth))
@@ -261,7 +264,7 @@ class WorldTrials:
 
         Args:
             jobs: grasp and direction (n, 2).
-            left: chunks (n,).
+            left: steps (n,).
             home: poses of the objects at the start (n, O, 7).
         """
         state = [values[worlds] for values in sim.states()]
@@ -270,7 +273,7 @@ class WorldTrials:
         def end(number: int) -> None:
             for w in order[number::threads]:
                 i, k = jobs[w]
-                load = np.tile(self._base_rotation @ AXES[k], (left[w] * sim.chunk, 1))
+                load = np.tile(self._base_rotation @ AXES[k], (left[w], 1))
                 own = Pulls(*(values[i] for values in pulls))
                 begun = [values[w] for values in state]
                 wild[w] = self._spare[number].go_on(begun, home[w], load, own, k, so_far[w])

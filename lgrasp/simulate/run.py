@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -144,7 +143,7 @@ def verdicts(
         if prepared:
             prepared(time.perf_counter() - begin)
         if worlds:
-            with _silence():
+            with _silence:
                 some = worlds.run(group.rows, advanced)
         elif protocol.engine != "mujoco" and threads > 1 and len(group.rows) > _FEW:
             some = _in_processes(model, group.rows, threads, advanced, all_directions, keep)
@@ -203,11 +202,11 @@ def _on_threads(
         return own.trial.run(rows, i)
 
     pool = ThreadPoolExecutor(threads)
-    try:
-        with _silence():
+    with _silence:
+        try:
             return _collected([pool.submit(judge, i) for i in range(len(rows))], progress)
-    finally:  # a row of another simulator may take a minute
-        pool.shutdown(wait=model.protocol.engine == "mujoco", cancel_futures=True)
+        finally:  # a row of another simulator may take a minute
+            pool.shutdown(wait=model.protocol.engine == "mujoco", cancel_futures=True)
 
 
 def _in_processes(
@@ -233,7 +232,7 @@ def _in_processes(
 def _judge(packed: bytes, i: int) -> Verdict:
     """Verdict of row i, in a process of its own."""
     trial, rows = _unpacked(packed)
-    with _silence():
+    with _silence:
         return trial.run(rows, i)
 
 
@@ -263,16 +262,31 @@ def _collected(found: Sequence[Future[Verdict]], progress: Callable[[int, int], 
     return [verdict.result() for verdict in found]
 
 
-@contextmanager
-def _silence() -> Iterator[None]:
-    """MuJoCo writes no MUJOCO_LOG.TXT into the user's folder: what diverged is in the verdicts."""
-    mujoco = import_mujoco()
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
+class _Silence:
+    """While anyone is inside, MuJoCo writes no MUJOCO_LOG.TXT into the user's folder: what diverged is in the verdicts.
+
+    The process has one handler of warnings, and batches are simulated side by side.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._before = threading.Lock(), 0, None
+
+    def __enter__(self) -> None:
+        mujoco = import_mujoco()
+        with self._lock:
+            if not self._inside:
+                self._before = mujoco.get_mju_user_warning()
+                mujoco.set_mju_user_warning(lambda _: None)
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                import_mujoco().set_mju_user_warning(self._before)
+
+
+_silence = _Silence()
 
 
 def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = False, device: str = "cpu") -> str:

@@ -174,6 +174,23 @@ def test_one_object_beside_several(cli, grasps):
     assert {line[1]: line[heads.index("stay")] for line in lines} == {"cube": "-", "one+two": "100.0%"}
 
 
+def test_one_object_in_a_shard_of_several(cli, tmp_path):
+    """It has the columns of several, which rows of the same object in a shard of one have not."""
+    rows, slots = twin_rows(), ("object_pose", "object_index", "contact_points", "contact_normals", "contact_forces")
+    alone = {name: getattr(rows, name)[:, :1] for name in (*slots, "contact_links")}
+    shard = twin_shard(replace(rows, **alone))
+    write_shard(tmp_path / "in" / "b.h5", replace(shard, objects=shard.objects[:1]))
+    absent = {name: getattr(rows, name).copy() for name in alone}
+    for name, values in absent.items():
+        values[:, 1] = -1 if name in ("object_index", "contact_links") else np.nan
+    write_shard(tmp_path / "in" / "a.h5", twin_shard(replace(rows, **absent)))
+    found = json.loads(cli("simulate", tmp_path / "in", "--json", "-").out)["results"]
+    assert [(entry["objects"], entry["rows"], entry["stay"]) for entry in found] == [
+        (["one"], 1, 1),
+        (["one"], 1, None),
+    ]
+
+
 def test_goes_on_where_it_was(cli, grasps, tmp_path):
     """What is there stays byte for byte; damage is made anew; a second protocol adds its own columns."""
     out = tmp_path / "verdicts"

@@ -150,7 +150,8 @@ def _moved_part(
     before, after = (torch.stack(list(terms)).detach().cpu().numpy() for terms in energies)  # each (6, N)
     away = refiner.target.nearest(refiner.middle(given.R, given.t))[0]  # of the middle of the palmar side
     far = int((away > _MAX_OBJECT_DISTANCE).sum())
-    return _Part(table, (before, after), (was, known, taken, good, failed_bounds(new, outcome, bounds)), far)
+    failed = failed_bounds(new, outcome, bounds, hand.model.tree.link_groups)
+    return _Part(table, (before, after), (was, known, taken, good, failed), far)
 
 
 def _rounded(bounds: GraspBounds) -> GraspBounds:

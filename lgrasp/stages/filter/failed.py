@@ -44,7 +44,7 @@ def failed_rows(
         seed=context.seed("filter", 1),
     )
     table = replace(press(table), slot=slot)
-    table.metrics["failed_bound"] = failed_bounds(table, outcome, bounds)
+    table.metrics["failed_bound"] = failed_bounds(table, outcome, bounds, context.hand.model.tree.link_groups)
     if obj.planes is not None:
         table.table["approach"] = _from_above(table, obj.planes)
     return take_rows(table, table.metrics["failed_bound"] > 0)
