@@ -23,7 +23,7 @@ from pydantic import (
 
 from lgrasp.errors import ConfigError, short_reason
 from lgrasp.notices import notice
-from lgrasp.paths import data_dirs
+from lgrasp.paths import data_dirs, user_path
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -160,7 +160,7 @@ def find_yaml(name: str, files: Mapping[str, Path], what: str) -> Path:
     Raises:
         ConfigError: neither.
     """
-    path = files.get(name) or Path(name).expanduser()
+    path = files.get(name) or user_path(name)
     if not path.is_file():
         hint, known = did_you_mean(path.stem, files), ", ".join(files) or "none"
         raise ConfigError(f"unknown {what} '{name}'; {hint}known: {known}, or give the path of a YAML file")
@@ -203,7 +203,10 @@ def _parsed(text: str | bytes) -> Any:
             values += sizes[event.anchor]
         if values > len(text):
             raise yaml.YAMLError(f"{where}: aliases stand for more values than are read")
-    return yaml.load(text, Loader=_YAML)
+    try:
+        return yaml.load(text, Loader=_YAML)
+    except (ValueError, TypeError, AttributeError) as error:  # a day that no month has, a tag of another value
+        raise yaml.YAMLError(f"a value cannot be read: {error}") from None
 
 
 def _keys_once(events: Iterable[Any]) -> Iterator[Any]:
@@ -235,7 +238,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         if size > _YAML_BYTES:
             raise yaml.YAMLError(f"it has {size:,} bytes; at most {_YAML_BYTES:,} are read")
         data = load_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:  # ValueError: not UTF-8, or a day that no month has
+    except (OSError, ValueError, yaml.YAMLError) as error:  # ValueError: not UTF-8
         raise ConfigError(f"file {path} cannot be read: {short_reason(error, 300)}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"file {path} must hold a YAML mapping, found {type(data).__name__}")

@@ -26,7 +26,7 @@ def data_dirs(kind: str) -> list[Path]:
     shipped = _PACKAGE / "_data" / kind
     if not shipped.is_dir():
         shipped = _PACKAGE.parent / kind
-    roots = [Path(p).expanduser() for p in os.environ.get("LGRASP_PATH", "").split(os.pathsep) if p]
+    roots = [user_path(p) for p in os.environ.get("LGRASP_PATH", "").split(os.pathsep) if p]
     for root in roots:
         notice("" if os.path.isdir(root) else f"LGRASP_PATH: {root} is no folder")
     return [p for p in (*(root / kind for root in roots), user_dir(kind), shipped) if os.path.isdir(p)]
@@ -67,12 +67,17 @@ def is_installed(distribution: str) -> bool:
     return next(iter(metadata.distributions(name=distribution)), None) is not None
 
 
+def user_path(name: str | os.PathLike[str]) -> Path:
+    """A path in which ``~`` and ``~USER`` stand for a home folder, unless there is no such user."""
+    return Path(os.path.expanduser(name))
+
+
 def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
     """The cache folder: ``override``, else ``LGRASP_CACHE_DIR``, else the platform's user cache folder."""
     if override:
-        return Path(override).expanduser()
+        return user_path(override)
     env = os.environ.get("LGRASP_CACHE_DIR")
-    return Path(env).expanduser() if env else Path(platformdirs.user_cache_dir("lgrasp"))
+    return user_path(env) if env else Path(platformdirs.user_cache_dir("lgrasp"))
 
 
 def check_input(path: Path, suffixes: Sequence[str], what: str, error: type[LgraspError]) -> None:
@@ -118,7 +123,7 @@ def named_paths(
     """
     found: dict[str, None] = {}
     for name in names:
-        path, members = Path(name).expanduser(), None
+        path, members = user_path(name), None
         if name not in known and path.is_dir() and not usable(path):
             members = path.iterdir()
         elif name not in known and glob.has_magic(name) and not path.exists():

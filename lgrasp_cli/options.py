@@ -10,6 +10,7 @@ import typer
 from typer import Argument, Option
 
 from lgrasp.choices import ProtocolName
+from lgrasp.paths import user_path
 from lgrasp_cli.names import DEVICE, HAND, OBJECT, PIPELINE, one_of
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def open_cache(folder: Path | None, *, fresh: bool = False) -> "Cache":
     import os
 
     if folder is not None:
-        os.environ["LGRASP_CACHE_DIR"] = str(folder.expanduser().absolute())
+        os.environ["LGRASP_CACHE_DIR"] = str(user_path(folder).absolute())
     from lgrasp.engine.cache import Cache
 
     return Cache(folder, warn=warn, fresh=fresh)

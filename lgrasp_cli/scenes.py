@@ -100,11 +100,12 @@ def _config(objects: list[str], changes: dict[str, Any], on_table: int | None, v
     named = len(objects) == 1 and (config or objects[0] in scene_configs())
     data: dict[str, Any] = read_scene_config(objects[0]) if named else {"objects": objects}
     data |= changes
-    if on_table is not None or views is not None:
-        scene = data["scene"] = data.get("scene") or {}
-        scene |= given(objects=on_table)
-        if views is not None:
-            scene["camera"] = (scene.get("camera") or {}) | {"views": views}
+    scene = data.get("scene") or {}
+    if isinstance(scene, dict):  # else the config is refused
+        camera = scene.get("camera") or {}
+        if views is not None and isinstance(camera, dict):
+            scene |= {"camera": camera | {"views": views}}
+        data["scene"] = scene | given(objects=on_table)
     return data
 
 

@@ -13,7 +13,8 @@ from lgrasp.bench.rate import measure
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError, LgraspError, ObjectError
 from lgrasp.files import temporary_folder
-from lgrasp.jobs.config import JobConfig, in_folder, plan_requests
+from lgrasp.hand.names import all_hands
+from lgrasp.jobs.config import JobConfig, config_objects, in_folder, plan_requests
 from lgrasp.object.find import find_object
 from lgrasp.runtime.device import resolve_device
 from lgrasp.words import number
@@ -33,7 +34,8 @@ def new_table(config: JobConfig, *, repeat: int, baseline_rows: int, published: 
         ConfigError: two hands, objects or pipelines of one name.
         DeviceError: the device does not exist.
     """
-    named = {kind: [Path(name).stem for name in getattr(config, kind)] for kind in ("pipelines", "hands", "objects")}
+    asked = {"pipelines": config.pipelines, "hands": all_hands(config.hands), "objects": config_objects(config)}
+    named = {kind: [Path(name).stem for name in names] for kind, names in asked.items()}
     for kind, names in named.items():
         check_once(kind[:-1], names)
     settings = {

@@ -102,8 +102,8 @@ class Manifest(_Listed):
     def ask(self, run: ListedRun, making: Collection[str], busy: Mapping[str, str]) -> None:
         """Take up what a run is asked for now: what was made stays so unless more rows are asked.
 
-        Files of other runs are this run's from now on; those of this run that are not asked any more stay while they
-        are on disk.
+        Files of other runs are this run's from now on, and what else those were asked for and never made is forgotten;
+        files of this run that are not asked any more stay while they are on disk.
 
         Args:
             making: Files that are going to be made.
@@ -122,6 +122,9 @@ class Manifest(_Listed):
         names = {shard.file for shard in asked}
         earlier = [s for r in self.runs if r.run_key == run.run_key for s in r.shards if s.file not in names]
         kept = [shard.model_copy(update={"asked": None}) for shard in earlier if shard.written]
+        for other in self.runs:
+            if other.run_key not in busy and names & {shard.file for shard in other.shards}:
+                self.drop({shard.file for shard in other.shards if not shard.written} - names)
         self._give(run.model_copy(update={"shards": asked + kept}), names)
 
     def record(self, run: ListedRun, shards: Iterable[ListedShard]) -> None:

@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import os
+import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -160,6 +161,11 @@ class Cache:
             if (kinds is None or entry.kind in kinds) and (older_than is None or entry.modified < older_than):
                 entry.path.unlink(missing_ok=True)
                 files, size = files + 1, size + entry.size
+        for folder in (self.root / "variants").glob("*/") if kinds is None else ():
+            if older_than is None or folder.stat().st_mtime < older_than:
+                found = [path for path in folder.rglob("*") if path.is_file()]
+                files, size = files + len(found), size + sum(path.stat().st_size for path in found)
+                shutil.rmtree(folder, ignore_errors=True)
         remove_leftovers(self.root, "*/*.tmp")
         for folder in (self.root / "kernels").glob("*/"):
             remove_unfinished(folder)

@@ -137,11 +137,11 @@ class Pipeline(_Head):
         if not self.open_to_hands:
             return self
         if "close" in self.order:
-            return self._closing() if joints <= self.params("close").joints else self.without("close")
+            return self.closing() if joints <= self.params("close").joints else self.without("close")
         adjusts = joints <= self.params("adjust").joints and not self.poses_stay
         return self.without("ik" if adjusts else "adjust")
 
-    def _closing(self) -> "Pipeline":
+    def closing(self) -> "Pipeline":
         """A copy in which fingers close: contacts in reach tell little of where they will touch, and a contact point of
         the object must be near by."""
         points = max(self.object.contact_count, self.params("close").contact_count)

@@ -48,9 +48,11 @@ class Job(Request, ABC):
     """True if all parts have the key of the job, and so have all files of their name in the folder."""
     differs: ClassVar[str] = "other parameters"
     """What may be other in a file with another key."""
+    late_key: ClassVar[bool] = False
+    """True if the key is known only once what the parts are made of was made."""
 
     cache: Cache = Field(default_factory=Cache, exclude=True, repr=False)
-    _device: Device = PrivateAttr()
+    _device: Device | None = PrivateAttr(None)
     _events: Events = PrivateAttr(default_factory=Events)
     _manifests: Listing | Renewing | None = PrivateAttr(None)
     _growing: set[int] = PrivateAttr(default_factory=set)  # numbers of parts that are there with fewer rows
@@ -214,12 +216,12 @@ class Job(Request, ABC):
 
     @property
     def device_used(self) -> Device:
-        """The device, once the job has started."""
-        return self._device
+        """The device, once the job has started; before that, where its parts are asked for, the CPU."""
+        return self._device or resolve_device("cpu")
 
     def threads(self) -> int:
         """Workers as asked, else one per core, or one on a GPU."""
-        return threads(self.workers or int(self._device.is_cuda))
+        return threads(self.workers or int(self.device_used.is_cuda))
 
 
 def run(

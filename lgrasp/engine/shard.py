@@ -36,7 +36,7 @@ _GPU_SMALLEST, _GPU_LARGEST = 2_048, 524_288  # candidates of a batch
 _GROUP_BYTES = 4_000  # of device memory for a candidate and a group of the hand, generously
 _CONTACT_BYTES = 64  # the same for a contact of its domain
 _SET_BYTES = 32  # the same for a set of contacts
-_STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
+STREAM = 2**31 - 2**20  # candidates of a shard have 31-bit numbers
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def _batch_size(
 def shard_effort(pipeline: Pipeline, rows: int) -> int:
     """Candidates that a shard of ``rows`` rows tries before it may give up."""
     steps = -(-max(_LEAST_EFFORT, rows * pipeline.effort) // _EFFORT_STEP)
-    return min(steps * _EFFORT_STEP, _STREAM)
+    return min(steps * _EFFORT_STEP, STREAM)
 
 
 def gave_up(pipeline: Pipeline, rows: int, found: int, tried: int) -> bool:
@@ -111,7 +111,7 @@ def gave_up(pipeline: Pipeline, rows: int, found: int, tried: int) -> bool:
 
 def _most_effort(pipeline: Pipeline, rows: int) -> int:
     """Candidates that a shard of ``rows`` rows may try."""
-    return min(pipeline.patience * shard_effort(pipeline, rows), _STREAM)
+    return min(pipeline.patience * shard_effort(pipeline, rows), STREAM)
 
 
 def shard_context(pipeline: Pipeline, inputs: Inputs, shard: int) -> Context:

@@ -35,6 +35,7 @@ from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest, hand_n
 from lgrasp.jobs.sets import SequenceSets, object_sequences
 from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object, list_objects, mesh_files
+from lgrasp.paths import user_path
 from lgrasp.steer.params import Steering
 
 _OF_SINGLE = {"batch", "negatives", "passes", "scale", "simulate", "table"}  # keys for one object a grasp
@@ -179,7 +180,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
         ConfigError: a pipeline that cannot be used, a folder of hands or objects that does not exist, too few objects
             for the sequences.
     """
-    objects, sets = _objects(config), config.sequences
+    objects, sets = config_objects(config), config.sequences
     drawn = object_sequences(objects, sets, config.seed or 0) if sets else []
     hands = [_urdf_in_folder(config.hand_dir, hand) for hand in all_hands(config.hands)]
     shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
@@ -264,10 +265,10 @@ def _pipelines(config: JobConfig) -> Iterator[Pipeline]:
         yield pipeline.with_seed(config.seed)
 
 
-def _objects(config: JobConfig) -> tuple[str, ...]:
+def config_objects(config: JobConfig) -> tuple[str, ...]:
     """The objects of a config, those of its folder if it names none, without those held out."""
     for key, folder in (("hand_dir", config.hand_dir), ("object_dir", config.object_dir)):
-        if folder is not None and not folder.expanduser().is_dir():
+        if folder is not None and not user_path(folder).is_dir():
             raise ConfigError(f"{key} {folder} is not a folder")
     if not config.objects and config.object_dir is None:
         raise ConfigError("the config names no objects; give object_dir, a folder of meshes (--object-dir)")
@@ -292,7 +293,7 @@ def _contents(config: JobConfig, mesh: str) -> str:
 
 def _urdf_in_folder(folder: Path | None, hand: str) -> str:
     """``folder/NAME/NAME.urdf`` if there is one; else the name as it is."""
-    path = folder and folder.expanduser() / hand / f"{hand}.urdf"
+    path = folder and user_path(folder) / hand / f"{hand}.urdf"
     return str(path) if path and path.is_file() else hand
 
 
@@ -303,10 +304,10 @@ def in_folder(folder: Path | None, mesh: str) -> str:
     """
     if folder is None:
         return mesh
-    here = folder.expanduser()
+    here = user_path(folder)
     path = here / mesh
     found = next((p for p in (path, *(here / f"{mesh}{s}" for s in MESH_SUFFIXES)) if p.is_file()), None)
     found = found or mesh_files(path.parent).get(path.name)
-    if not found and (":" in mesh or mesh in list_objects() or Path(mesh).expanduser().is_file()):
+    if not found and (":" in mesh or mesh in list_objects() or user_path(mesh).is_file()):
         return mesh
     return str(found or path)

@@ -49,8 +49,9 @@ def list_objects() -> list[dict[str, Any]]:
         if (folder / "objects.yaml").is_file():
             notes = read_yaml(folder / "objects.yaml") | notes
     empty = {"faces": None, "licence": "", "description": ""}
+    told = {name: note for name, note in notes.items() if isinstance(note, dict)}
     return [
-        {"name": name, "file": str(path), **{key: notes.get(name, {}).get(key, value) for key, value in empty.items()}}
+        {"name": name, "file": str(path), **{key: told.get(name, {}).get(key, value) for key, value in empty.items()}}
         for name, path in named_objects().items()
     ]
 
@@ -149,7 +150,7 @@ def describe_pipeline(name: str) -> dict[str, Any]:
     """
     pipeline = load_pipeline(name)
     sections = ((part.name, params) for part, params in pipeline.sections)
-    parts = [*((name, getattr(pipeline, name)) for name in ("bounds", "steer", "object", "field")), *sections]
+    parts = [*((name, getattr(pipeline, name)) for name in ("bounds", "steer", "object", "field", "hand")), *sections]
     rows: list[tuple[str, str, Any, str, str]] = [
         ("", "seed", pipeline.seed, _accepted(pipeline, "seed"), "Base seed of all stages."),
         *(("", key, getattr(pipeline, key), *_about(pipeline, key)) for key in ("effort", "patience")),

@@ -14,7 +14,7 @@ from lgrasp.engine.inputs import InputKeys, input_keys, load_inputs
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.engine.registry import STAGES
 from lgrasp.engine.run import Job
-from lgrasp.engine.shard import shard_context
+from lgrasp.engine.shard import STREAM, shard_context
 from lgrasp.errors import ConfigError
 from lgrasp.grasp.tables import CandidateTable, ContactSets, DeviceTable, PoseTable, grasp_arrays
 from lgrasp.jobs.hands import for_hand, hand_source
@@ -25,7 +25,6 @@ from lgrasp.runtime.tally import Meter
 _ELSE = {
     **dict.fromkeys(("domain", "ik", "wrap"), ("adjust", "close")),
     "adjust": ("ik",),
-    "close": ("domain", "ik", "wrap"),
 }
 """Stages that a hand has in place of others, and these."""
 
@@ -67,8 +66,10 @@ def run_up_to(
     """
     if last not in pipeline.order:
         raise ConfigError(f"pipeline {pipeline.name} has no stage {last}; its stages: {', '.join(pipeline.order)}")
-    if pipeline.open_to_hands and last in _ELSE:
-        pipeline = pipeline.without(*_ELSE[last])
+    if first + count > STREAM:
+        raise ConfigError(f"candidates {first:,} to {first + count - 1:,}: those below {STREAM:,} are accepted")
+    if pipeline.open_to_hands:
+        pipeline = pipeline.closing() if last == "close" else pipeline.without(*_ELSE.get(last, ()))
     pipeline, used = for_hand(pipeline, hand), resolve_device(device)
     keys = input_keys(hand_source(hand), mesh, scale, pipeline.object, pipeline.field, pipeline.hand)
     stages = pipeline.order[: pipeline.order.index(last) + 1]

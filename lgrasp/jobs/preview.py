@@ -28,7 +28,7 @@ def preview(job: Job, *, array: Array | tuple[int, int], resume: bool) -> list[P
         LgraspError: bad input, as :func:`lgrasp.engine.run.run` would raise it before computing.
     """
     with _no_kernel_folder():
-        _, _, _, parts, present = look(job, array=array, resume=resume)
+        _, _, _, parts, present = look(job, array=array, resume=resume and not job.late_key)
     lines = _inputs(job) if isinstance(job, GenerateJob) else []
     for part in parts:
         number, file = str(part.number), str(part.file)
@@ -36,6 +36,9 @@ def preview(job: Job, *, array: Array | tuple[int, int], resume: bool) -> list[P
             lines.append(
                 PlanLine("shard", number, "present", f"nothing, {present[part.number]:,} rows are there", file)
             )
+            continue
+        if job.late_key and resume and part.file.exists():
+            lines.append(PlanLine("shard", number, "present", "nothing, if it is of the same grasps", file))
             continue
         what = f"{part.rows:,} {job.unit}" + (", replacing the file" if part.file.exists() else "")
         lines.append(PlanLine("shard", number, "missing", what, file))

@@ -34,6 +34,7 @@ from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.records import RULES
 from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
+from lgrasp.paths import user_path
 from lgrasp.runtime.device import Device
 
 
@@ -44,7 +45,7 @@ def named_hand(cache: Cache, name: str, device: Device) -> tuple[HandSource, Han
         HandError, ShardError: there is no such hand, or it cannot be used.
     """
     if name.endswith(".h5"):
-        with ShardReader(Path(name).expanduser()) as reader:
+        with ShardReader(user_path(name)) as reader:
             return hand_of_shard(cache, reader.hand(), reader.header.config, device)
     return _built(cache, hand_source(name), device)
 
@@ -139,7 +140,7 @@ def named_object(cache: Cache, name: str, scale: float, device: Device) -> Objec
     if not name.endswith(".h5"):
         mesh, key = object_key(name, scale, ObjectParams())
         return Loader(cache, device.alias).object(mesh, key, scale, ObjectParams())
-    with ShardReader(Path(name).expanduser()) as reader:
+    with ShardReader(user_path(name)) as reader:
         if len(reader.object_ids) != 1:
             raise ShardError(f"{name}: holds the objects {', '.join(reader.object_ids)}; a shard of one is accepted")
         (record,) = reader.objects()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lgrasp.config import did_you_mean
 from lgrasp.errors import ConfigError, HandError, short_reason
-from lgrasp.paths import data_dirs
+from lgrasp.paths import data_dirs, user_path
 
 if TYPE_CHECKING:
     import torch
@@ -35,7 +35,7 @@ def find_network(name: str) -> Path:
     Raises:
         ConfigError: neither.
     """
-    path, known = Path(name).expanduser(), known_networks()
+    path, known = user_path(name), known_networks()
     if path.is_file():
         return path
     if name not in known:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lgrasp.errors import ConfigError
 from lgrasp.hand.names import known_hands
+from lgrasp.paths import user_path
 
 SHIPPED = "hand"
 """Stands for the policy that is shipped with a hand, if there is one."""
@@ -28,7 +29,7 @@ def policy_file(path: str | Path) -> bytes:
         ConfigError: it cannot be read, or is too large to be one.
     """
     try:
-        with open(Path(path).expanduser(), "rb") as file:
+        with open(user_path(path), "rb") as file:
             data = file.read(_MOST_BYTES + 1)
     except OSError as error:
         raise ConfigError(

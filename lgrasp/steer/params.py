@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from lgrasp.choices import PalmUse, SideName, ThumbPlace
 from lgrasp.config import Numbers, Params, comma_numbers
 from lgrasp.object.region_text import ACCEPTED, Region, describe_region, parse_regions
+from lgrasp.paths import user_path
 from lgrasp.steer.grasp_types import find_type
 
 if TYPE_CHECKING:
@@ -106,9 +107,9 @@ class Steering(Params):
     @field_validator("pose")
     @classmethod
     def _is_there(cls, value: Path | None) -> Path | None:
-        if value is not None and not value.expanduser().is_file():
+        if value is not None and not user_path(value).is_file():
             raise ValueError("no such file")
-        return value and value.expanduser()
+        return value and user_path(value)
 
     @model_validator(mode="after")
     def _together(self) -> "Steering":

@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def read_poses(path: Path) -> np.ndarray:
     where = f"steer.pose: {path}"
     try:
         poses, of_hand = _read(path)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ConfigError(f"{where} cannot be read: {short_reason(error)}") from None
     if poses.ndim == 3 and poses.shape[1:] == (4, 4):
         poses = poses.reshape(-1, 16)

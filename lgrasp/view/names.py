@@ -1,7 +1,6 @@
 """What the words after ``lgrasp view`` name; nothing is read."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal
 
 from lgrasp.config import did_you_mean
@@ -9,6 +8,7 @@ from lgrasp.dataset.files import shards_below
 from lgrasp.errors import ConfigError
 from lgrasp.hand.names import PACKAGE_HANDS, known_hands
 from lgrasp.object.find import MESH_SUFFIXES, OBJECT_PACKAGES, list_objects
+from lgrasp.paths import user_path
 
 
 def kind_of(what: Sequence[str]) -> Literal["hand", "object", "files"]:
@@ -18,7 +18,7 @@ def kind_of(what: Sequence[str]) -> Literal["hand", "object", "files"]:
         ConfigError: nothing of that name.
         ShardError: no such file, or a folder without shards.
     """
-    name, path = what[0], Path(what[0]).expanduser()
+    name, path = what[0], user_path(what[0])
     is_file, by_name = len(what) == 1 and path.is_file(), len(what) == 1 and not path.exists()
     hands, objects = [*known_hands(), *PACKAGE_HANDS], list(list_objects())
     if ":" in name:  # of a package
@@ -31,5 +31,5 @@ def kind_of(what: Sequence[str]) -> Literal["hand", "object", "files"]:
         known = [*hands, *objects]
         hint = did_you_mean(name, known)
         raise ConfigError(f"'{name}' is no file, folder, hand or object; {hint}known are {', '.join(known)}")
-    shards_below([Path(one).expanduser() for one in what])
+    shards_below([user_path(one) for one in what])
     return "files"

@@ -3,7 +3,6 @@
 import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +11,7 @@ from lgrasp.dataset.reader import open_hdf5
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.engine.cache import Cache
 from lgrasp.errors import ConfigError
+from lgrasp.paths import user_path
 from lgrasp.scenes.schema import FORMAT
 from lgrasp.view.names import kind_of
 from lgrasp.view.server import Site, View, close_site, open_site
@@ -100,7 +100,7 @@ def _refuse(what: str, **options: object) -> None:
 
 def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) -> "_Make":
     """What makes the view, all input read."""
-    name, path, kind = what[0], Path(what[0]).expanduser(), kind_of(what)
+    name, path, kind = what[0], user_path(what[0]), kind_of(what)
     inside = sorted(path.glob("*.h5")) if kind == "files" and path.is_dir() else [path]
     if len(what) == 1 and inside and inside[0].is_file() and inside[0].suffix == ".h5":
         with open_hdf5(inside[0]) as file:
@@ -117,7 +117,7 @@ def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) ->
     if kind in {"hand", "object"}:
         _refuse(f"{kind} {name}", row=row, where=where)
         return (_hand if kind == "hand" else _object)(name, cache)
-    rows, conditions = SceneRows([Path(one).expanduser() for one in what]), ", ".join(where)
+    rows, conditions = SceneRows([user_path(one) for one in what]), ", ".join(where)
     (readable,) = rows.sound(range(row, max(len(rows), row + 1)), most=1, look=rows.read)
     rows.meeting(conditions)
 

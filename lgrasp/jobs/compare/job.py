@@ -55,7 +55,8 @@ class ComparedHand(NamedTuple):
 def _varied(name: str, variation: Variation, cache: Cache) -> ComparedHand:
     source = hand_source(name)
     content = hand_digest(source.urdf, source.spec)
-    key = content_key("variant", _VERSION, content=content, variation=list(variation))
+    rules = source.spec.model_dump(mode="json") | {"roles": source.spec.roles}  # digests of hands leave some out
+    key = content_key("variant", _VERSION, content=content, rules=rules, variation=list(variation))
     label = f"{source.name}-{variation.label}"
     folder = cache.root / "variants" / key[:32] / label
     try:

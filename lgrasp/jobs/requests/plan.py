@@ -79,6 +79,8 @@ class PlanRequest(Request):
         if self.mask is not None:
             check_input(self.mask, MASK_SUFFIXES, "a mask", CloudError)
         if self.model is not None:
+            if self.stand_off is not None:
+                raise ConfigError("--stand-off belongs to starts of the surface; a network draws its own (--model)")
             check_network(self.model, "grasp", self.hand)
         if self.out is not None:
             check_folder(self.out)

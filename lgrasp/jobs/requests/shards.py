@@ -20,7 +20,7 @@ from lgrasp.hold.params import HoldTest
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.params import LearnParams
-from lgrasp.paths import check_input
+from lgrasp.paths import check_input, user_path
 from lgrasp.reach.placement import ORIGIN, Placement
 from lgrasp.refine.params import COARSE, LocalSearch
 from lgrasp.simulate.protocol import Protocol, find_protocol
@@ -228,7 +228,7 @@ def look_up(name: str, find: Callable[[str], object]) -> None:
         HandError, ObjectError, ShardError: there is none.
     """
     if name.endswith(".h5"):
-        find_shards(Path(name).expanduser())
+        find_shards(user_path(name))
     else:
         find(name)
 

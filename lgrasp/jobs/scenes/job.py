@@ -56,6 +56,7 @@ class SceneJob(SceneRequest, Job):
     kernels: ClassVar[tuple[str, ...]] = ("lgrasp.scenes.",)
     one_key: ClassVar[bool] = False
     differs: ClassVar[str] = "other hand, objects, grasps, parameters or seed"
+    late_key: ClassVar[bool] = True
 
     @property
     def hand_name(self) -> str:
