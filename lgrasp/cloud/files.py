@@ -52,12 +52,16 @@ def read_arrays(path: Path, read_scene: SceneCloud | None) -> dict[str, np.ndarr
     flat = points.reshape(-1, points.shape[-1]).astype(np.float64)
     out = {"points": flat[:, :3]} | ({"normals": flat[:, 3:]} if flat.shape[1] == 6 and not _colours(flat) else {})
     for name in found.keys() - {"points", "faces"}:
-        values, shape = np.asarray(found[name]), (len(flat), 3) if name == "normals" else (len(flat),)
-        if values.size != np.prod(shape):
+        values, normals = np.asarray(found[name]), name == "normals"
+        fits = values.size == len(flat)
+        if normals:  # another order of axes would scramble them
+            fits = values.shape in ((len(flat), 3), (*points.shape[:-1], 3)) and values.dtype.kind in "fiu"
+        if not fits:
             raise CloudError(
-                f"{path}: {name} have shape {values.shape}, the points {points.shape}; one for each is accepted"
+                f"{path}: {name} are an array of {values.dtype} of shape {values.shape}, the points of shape "
+                f"{points.shape}; {'three numbers' if normals else 'one'} for each is accepted"
             )
-        out[name] = values.reshape(shape).astype(np.float64 if name == "normals" else values.dtype)
+        out[name] = values.reshape(-1, 3).astype(np.float64) if normals else values.ravel()
     return out | ({"faces": found["faces"]} if "faces" in found else {})
 
 
@@ -88,8 +92,10 @@ def check_labels(values: np.ndarray, count: int, where: str) -> np.ndarray:
     Raises:
         CloudError: not integers or flags, or of another length.
     """
-    if values.dtype.kind not in "biuf" or (values.dtype.kind == "f" and (values != np.round(values)).any()):
+    if values.dtype.kind not in "biuf":
         raise CloudError(f"{where}: labels are {values.dtype}, whole numbers or flags are accepted")
+    if values.dtype.kind == "f" and not (whole := np.isfinite(values) & (values == np.round(values))).all():
+        raise CloudError(f"{where}: label {values[~whole][0]:g}; whole numbers or flags are accepted")
     if values.size != count:
         raise CloudError(f"{where}: {values.size:,} labels for a cloud of {count:,} points; one for each is accepted")
     return values.ravel().astype(np.int64)

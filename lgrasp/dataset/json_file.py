@@ -30,7 +30,7 @@ class JsonFile(Params):
             data = json.loads(Path(path).read_bytes())
         except OSError as error:
             raise ConfigError(f"{kind} {path}: {error.strerror or error}") from None
-        except ValueError:
+        except (ValueError, RecursionError):
             data = None
         if not isinstance(data, dict) or data.pop("format", None) != cls.FORMAT:
             raise ConfigError(f"{path}: no {kind}; {cls.MADE_BY} writes one")

@@ -214,6 +214,8 @@ def read_manifest(path: str | os.PathLike[str]) -> Manifest | None:
         names = [shard.file for shard in manifest.shards] if manifest else []
         if len(set(names)) < len(names):
             raise ValueError("a file is listed twice")
+        if manifest:
+            manifest.drop(())  # runs without a file
     return manifest
 
 

@@ -190,14 +190,15 @@ class ShardReader(FileReader):
 
     @cached_property
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
-        """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...)."""
+        """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...), in the byte order of this
+        computer."""
         names = [*GRASP_FIELDS, *(SEQUENCE_FIELDS if self.space_names is not None else ())]
         names += TABLE_FIELDS if "grasps/table" in self._nodes else ()
         for path in (path for group in ("metrics", "physics") for path in expand(self._nodes, f"grasps/{group}/*")):
             name = path.removeprefix("grasps/")
             names.append(_RENAMED.get(name, name))
         found = {name: self._dataset(name) for name in names}
-        return {name: (dataset.shape, dataset.dtype) for name, dataset in found.items()}
+        return {name: (dataset.shape, dataset.dtype.newbyteorder("=")) for name, dataset in found.items()}
 
     @property
     def object_keys(self) -> list[tuple[str, str, float]]:
@@ -216,11 +217,12 @@ class ShardReader(FileReader):
         if name not in self.columns:
             raise ShardError(f"{self.path}: no dataset {name!r}; it has {', '.join(self.columns)}")
         with reading(self.path):
+            dataset, native = self._dataset(name), self.columns[name][1]
             if self.taken is None:
-                return self._dataset(name)[start:stop]
+                return dataset[start:stop].astype(native, copy=False)
             rows = self.taken[start:stop]
             first, end = (rows[0], rows[-1] + 1) if len(rows) else (0, 0)
-            values = self._dataset(name)[first:end][rows - first]
+            values = dataset[first:end][rows - first].astype(native, copy=False)
             if name == "sequence/parent":
                 place = np.append(np.full(self._dataset("q").shape[0], -1), -1)  # the last of rows without parent
                 place[self.taken] = np.arange(len(self.taken))

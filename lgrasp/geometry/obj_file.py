@@ -50,6 +50,11 @@ def read_obj(data: bytes) -> RawMesh:
             polygon = [int(corner.partition("/")[0]) for corner in rest.split()]
             if len(polygon) < 3:  # a point or a line
                 continue
+            if 0 in polygon or min(polygon) < -len(vertices):
+                wrong = next(i for i in polygon if i == 0 or i < -len(vertices))
+                raise ValueError(
+                    f"a face names vertex {wrong} after {len(vertices)} vertices; they count from 1, or back from -1"
+                )
             corners += [i - 1 if i > 0 else len(vertices) + i for i in polygon]
             for name in {name for names in now.values() for name in names}:
                 groups.setdefault(name, []).append(len(sizes))
@@ -59,7 +64,7 @@ def read_obj(data: bytes) -> RawMesh:
     colours = np.array([v[3:] for v in vertices], float) if coloured else None
     if not corners:
         raise ValueError("0 faces")
-    if min(corners) < 0 or max(corners) >= len(numbers):
+    if max(corners) >= len(numbers):
         raise ValueError(f"a face names vertex {max(corners) + 1} of {len(numbers)}")
     faces, of = cut_polygons(numbers, np.array(corners), np.array(sizes))
     first = np.searchsorted(of, np.arange(len(sizes) + 1))

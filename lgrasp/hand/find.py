@@ -13,7 +13,7 @@ from lgrasp.hand.spec_check import space_problem
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import Urdf, read_urdf
 from lgrasp.notices import notice
-from lgrasp.paths import name_problem
+from lgrasp.paths import name_problem, user_path
 
 _SAME_SHAPE = 0.01  # [m] that joints of hands of one shape are apart at most
 _SAME_FRAME = 0.1  # [rad] that their frames are turned at most
@@ -55,7 +55,7 @@ def find_hand(name: str, draft: Drafter | None = None) -> HandSource:
     path = hand_path(name)
     if path.is_dir():
         return _from_folder(path)
-    if path != Path(name).expanduser():
+    if path != user_path(name):
         source = _from_package(path, name.replace(":", "_"), draft)
     elif (path.parent / "hand.yaml").is_file():
         source = _from_folder(path.parent, path)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from lgrasp.config import did_you_mean
 from lgrasp.errors import HandError
-from lgrasp.paths import data_dirs, named_paths, package_files
+from lgrasp.paths import data_dirs, named_paths, package_files, user_path
 
 
 class PackageHand(NamedTuple):
@@ -86,7 +86,7 @@ def hand_path(name: str) -> Path:
         HandError: nothing of that name (the message lists what is known), or a package that is not installed.
     """
     known = known_hands()
-    path = known.get(name, Path(name).expanduser())
+    path = known.get(name, user_path(name))
     if path.is_dir() and not (path / "hand.yaml").is_file():
         raise HandError(f"hand folder {path} has no hand.yaml; name a URDF file or a folder with hand.yaml")
     if path.is_dir() or path.is_file():

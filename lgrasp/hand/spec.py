@@ -8,6 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationIn
 from lgrasp.choices import Role
 from lgrasp.config import parse_model, read_yaml
 from lgrasp.errors import ConfigError, HandError
+from lgrasp.math.limits import MAX_KINDS
 
 Vec3 = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
@@ -115,7 +116,7 @@ class HandSpec(_Strict):
     palm: PalmRule = PalmRule()
     canonical_box: Box
     stand_off: float | None = Field(default=None, gt=0, le=1)
-    contacts: tuple[int, ...] = ()
+    contacts: tuple[Annotated[int, Field(ge=1)], ...] = Field(default=(), max_length=MAX_KINDS)
     open_posture: dict[str, float] = Field(default_factory=dict)
     fingers: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     roles: dict[str, Role] = Field(default_factory=dict, exclude=True)

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 _PLAIN_INTERVAL = 10.0  # [s] between lines of progress where standard error is no terminal
+_CLEAR = "\r\033[K"  # of a terminal: the line is empty
 
 
 def judge(
@@ -53,7 +54,12 @@ def judge(
             existing(path)
         from lgrasp.judge import run
 
-        report = run.judge(files, urdf=urdf, mesh=meshes or None, rows=rows, progress=None if quiet else _Progress())
+        progress = None if quiet else _Progress()
+        try:
+            report = run.judge(files, urdf=urdf, mesh=meshes or None, rows=rows, progress=progress)
+        finally:
+            if progress:
+                progress.close()
         text = json.dumps(report.to_dict(), indent=1, allow_nan=False)
         if json_path and json_path != "-":
             write_report(json_path, text + "\n")
@@ -75,15 +81,22 @@ class _Progress:
 
     def __init__(self) -> None:
         self._live = sys.stderr.isatty()
-        self._start = self._said = time.monotonic()
+        self._start = self._said = 0.0  # until it is called
 
     def __call__(self, done: int, total: int) -> None:
         now = time.monotonic()
+        if not self._start:
+            self._start = self._said = now
         if now - self._said < (0.2 if self._live else _PLAIN_INTERVAL):
             return
         self._said = now
         line = f"judging {done:,}/{total:,} rows, {done / (now - self._start):,.0f}/s"
-        typer.echo(f"\r{line} " if self._live else line, err=True, nl=not self._live)
+        typer.echo(f"{_CLEAR}{line}" if self._live else line, err=True, nl=not self._live)
+
+    def close(self) -> None:
+        """Clear the line on a terminal, where the report follows."""
+        if self._live:
+            typer.echo(_CLEAR, err=True, nl=False)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """Which files are judged; light to import, so that a missing one is told at once."""
 
 import os
+import tempfile
+import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,18 +10,35 @@ from lgrasp.judge.bounds import JudgeError
 
 
 def find_shards(given: Sequence[str | Path]) -> list[Path]:
-    """Files, and every ``*.h5`` in folders at any depth, each once.
+    """Files, and every ``*.h5`` in folders at any depth, each once; links are followed.
 
     Raises:
         JudgeError: no such file or folder, or a folder without shards.
     """
     found: list[Path] = []
     for path in map(existing, given):
-        files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
+        files = _inside(path) if path.is_dir() else [path]
         if not files:
             raise JudgeError(f"{path}: no shard (*.h5) in this folder")
         found += map(existing, files)
-    return list(dict.fromkeys(found))
+    once: dict[Path, Path] = {}
+    for path in found:
+        once.setdefault(path.resolve(), path)
+    return list(once.values())
+
+
+def _inside(top: Path) -> list[Path]:
+    """Shards in a folder and those below it, sorted; each folder once."""
+    found: list[Path] = []
+    seen: set[str] = set()
+    for folder, below, names in os.walk(top, followlinks=True):
+        if (real := os.path.realpath(folder)) in seen:
+            below.clear()
+            continue
+        seen.add(real)
+        below.sort()
+        found += [Path(folder, name) for name in names if name.endswith(".h5")]
+    return sorted(found)
 
 
 def existing(path: str | Path) -> Path:
@@ -41,23 +60,40 @@ def check_report(path: str) -> None:
     Raises:
         JudgeError: they cannot.
     """
-    target = Path(path)
-    if target.is_dir():
+    if Path(path).is_dir():
         raise JudgeError(f"file {path} cannot be written: it is a folder; name a file")
-    if not os.access(target.parent, os.W_OK):
-        raise JudgeError(f"file {path} cannot be written: its folder is missing or read-only")
+    if _is_special(path):
+        return
+    nearest = next(folder for folder in Path(os.path.realpath(path)).parents if folder.exists())
+    try:
+        tempfile.TemporaryFile(dir=nearest).close()
+    except OSError as error:
+        raise JudgeError(f"file {path} cannot be written: {nearest}: {error.strerror}; name another") from error
 
 
 def write_report(path: str, text: str) -> None:
-    """Write findings as a file that is whole or absent.
+    """Write findings as a file that is whole or absent, with the folders above it; a link stays, and so does a pipe or
+    device, which is written to.
 
     Raises:
         JudgeError: it cannot be written.
     """
-    made = Path(f"{path}.tmp")
+    target = Path(os.path.realpath(path))
+    made = target.with_name(f"{uuid.uuid4().hex}.tmp")
     try:
-        made.write_text(text, encoding="utf-8")
-        made.replace(path)
+        if _is_special(path):
+            Path(path).write_text(text, encoding="utf-8")
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            made.write_text(text, encoding="utf-8")
+            made.replace(target)
+        finally:
+            made.unlink(missing_ok=True)
     except OSError as error:
-        made.unlink(missing_ok=True)
         raise JudgeError(f"file {path} cannot be written: {error.strerror}") from error
+
+
+def _is_special(path: str) -> bool:
+    """Something that is there and no regular file: it must not be replaced by one."""
+    return os.path.exists(path) and not os.path.isfile(path)

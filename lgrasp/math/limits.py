@@ -12,3 +12,5 @@ DOF_SIZES = (4, MAX_DOFS)
 """Most actuated joints of a group that a kernel may be compiled for."""
 MAX_CONTACTS = MAX_GROUPS + 1
 """Most contacts of a grasp: one of each finger, and the palm's."""
+MAX_KINDS = 16
+"""Most numbers of finger contacts that the search draws from."""

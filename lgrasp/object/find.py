@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lgrasp.errors import ObjectError
 from lgrasp.notices import notice
-from lgrasp.paths import data_dirs, name_problem, named_paths, package_files
+from lgrasp.paths import data_dirs, name_problem, named_paths, package_files, user_path
 from lgrasp.words import listed
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
@@ -46,7 +46,7 @@ def all_objects(names: Iterable[str]) -> tuple[str, ...]:
     told = f"holds no mesh; accepted: {', '.join(MESH_SUFFIXES)}"
     names, named = tuple(names), list_objects()
     found = named_paths(names, named, _is_mesh, lambda name: ObjectError(f"object '{name}' {told}"))
-    for folder in (Path(name).expanduser() for name in names if name not in named):
+    for folder in (user_path(name) for name in names if name not in named):
         if folder.is_dir():
             _tell_left_out(folder)
     return found
@@ -72,7 +72,7 @@ def find_object(name_or_path: str | os.PathLike[str]) -> Path:
         ObjectError: There is neither such a file nor such a name, the package is not installed, or the file's name
             cannot be used.
     """
-    path = Path(name_or_path).expanduser()
+    path = user_path(name_or_path)
     if path.is_file():
         if problem := name_problem(path.stem):
             raise ObjectError(f"object {str(path)!r}: a mesh file cannot have this name: {problem}")

@@ -253,9 +253,9 @@ def _weld(label: str, vertices: np.ndarray, faces: np.ndarray, notes: list[str])
     lookup[used] = inverse.ravel()
     if len(open_edges(lookup[faces])):  # equal vertices may lie in two cells of the grid
         near = cKDTree(vertices[used[first]]).query_pairs(_SAME, output_type="ndarray")
-        label = connected_component_labels(near, len(first))
-        lookup[used] = label[inverse.ravel()]
-        first = _least(label, first)
+        group = connected_component_labels(near, len(first))
+        lookup[used] = group[inverse.ravel()]
+        first = _least(group, first)
     keep = np.sort(first)  # in the file's order
     lookup = np.argsort(np.argsort(first))[lookup]
     faces = lookup[faces]

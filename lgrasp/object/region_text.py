@@ -10,7 +10,7 @@ from typing import Literal
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.object.find import MESH_SUFFIXES
-from lgrasp.paths import check_input
+from lgrasp.paths import check_input, user_path
 
 ACCEPTED = (
     "box:x0,y0,z0:x1,y1,z1, sphere:x,y,z:radius [m], group:NAME of the mesh file, color:#rrggbb of its vertices, "
@@ -59,7 +59,7 @@ def parse_region(text: str, option: str, *, share: bool = False) -> Region:
             raise _refusal(option, text, "names no group")
     else:
         name, tail = _cut(text)
-        path = Path(name).expanduser()
+        path = user_path(name)
         if path.suffix.lower() not in _FILES:
             raise _refusal(option, text, "names no region")
         check_input(path, _FILES, f"{option}: a mesh or weights file", ConfigError)

@@ -8,7 +8,7 @@ import warp as wp
 from lgrasp.geometry.clusters import one_per_cell
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.picture.camera import look_at
-from lgrasp.picture.depth import Images, LabelledMesh
+from lgrasp.picture.depth import NOTHING, Images, LabelledMesh
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.fetch import to_numpy
 from lgrasp.scenes.params import CameraParams
@@ -56,11 +56,14 @@ def image_normals(images: Images, window: int, device: str) -> np.ndarray:
 
 
 def add_noise(images: Images, params: CameraParams, rng: np.random.Generator) -> Images:
-    """Images with Gaussian noise of ``noise + noise_square * depth^2`` [m] on every depth, in steps of DEPTH_UNIT."""
+    """Images with Gaussian noise of ``noise + noise_square * depth^2`` [m] on every depth, in steps of DEPTH_UNIT;
+    nothing is seen at a depth beyond what a file can hold."""
     error = rng.standard_normal(images.depth.shape).astype(np.float32)
     depth = images.depth + error * (params.noise + params.noise_square * images.depth**2)
-    steps = np.clip(np.rint(depth / DEPTH_UNIT), 1, 2**16 - 1) * DEPTH_UNIT  # as a file can hold them
-    return replace(images, depth=np.where(images.depth > 0.0, steps, 0.0).astype(np.float32))
+    steps = np.maximum(np.rint(depth / DEPTH_UNIT), 1)
+    seen = (images.depth > 0.0) & (steps < 2**16)
+    depth = np.where(seen, steps * DEPTH_UNIT, 0.0).astype(np.float32)
+    return replace(images, depth=depth, labels=np.where(seen, images.labels, NOTHING))
 
 
 def draw_offsets(params: CameraParams, rng: np.random.Generator) -> np.ndarray:

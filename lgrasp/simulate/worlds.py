@@ -1,6 +1,5 @@
 """Many copies of one scene on one device, stepped together by MuJoCo Warp."""
 
-import math
 from collections.abc import Iterator
 from copy import copy
 from typing import Any, NamedTuple
@@ -229,7 +228,7 @@ class Worlds:
             force = d.xfrc_applied
             self._applied = wp.array(ptr=force.ptr, dtype=wp.float32, shape=(worlds, 6 * m.nbody), copy=False)
         self.state: Kept = (d.qpos, d.qvel, d.qacc_warmstart, self._applied, t.start, t.end, t.step)
-        self.chunk = math.ceil(CHUNK / self._timestep - 1e-6)
+        self.chunk = self.steps(CHUNK)
         self._graph: Any = None
         self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _BUFFER_WARNINGS)
         self._compile()

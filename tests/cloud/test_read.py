@@ -133,6 +133,15 @@ def test_nan_and_zero_depth_are_dropped_and_told(ball):
     assert any("dropped 5 of 2,000" in n for n in cloud.notes)
 
 
+def test_normals_of_another_form_are_refused(ball):
+    write, _, normals = ball
+    for given in (normals.T.copy(), normals.astype(str), normals.reshape(50, 40, 3)):
+        with pytest.raises(CloudError, match=r"ball.npz: normals are an array of .*; three numbers for each is"):
+            read_cloud(write("ball.npz", lambda p: p.reshape(40, 50, 3), normals=given))
+    image = read_cloud(write("ball.npz", lambda p: p.reshape(40, 50, 3), normals=normals.reshape(40, 50, 3)))
+    np.testing.assert_allclose(image.normals, normals, atol=1e-6)
+
+
 def test_mask_file(ball, tmp_path):
     write, points, _ = ball
     np.save(tmp_path / "mask.npy", points[:, 2] > CENTRE[2])
@@ -224,9 +233,10 @@ def test_mask_that_selects_nothing_names_its_labels(ball, tmp_path):
     np.save(tmp_path / "mask.npy", np.zeros(7, int))
     with pytest.raises(CloudError, match="7 labels for a cloud of 2,000 points"):
         read_cloud(write(), tmp_path / "mask.npy", 1)
-    np.save(tmp_path / "mask.npy", np.full(2000, 0.5))
-    with pytest.raises(CloudError, match="whole numbers"):
-        read_cloud(write(), tmp_path / "mask.npy", 1)
+    for value in (0.5, np.inf):
+        np.save(tmp_path / "mask.npy", np.full(2000, value))
+        with pytest.raises(CloudError, match=f"label {value}; whole numbers"):
+            read_cloud(write(), tmp_path / "mask.npy", 1)
 
 
 @pytest.mark.parametrize(

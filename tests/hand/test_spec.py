@@ -39,6 +39,9 @@ CHANGES = {
     "posture is text": ({"open_posture": {"joint_0.0": "half"}}, "open_posture.joint_0.0"),
     "posture not finite": ({"open_posture": {"joint_0.0": float("inf")}}, "open_posture.joint_0.0.*finite"),
     "locked is a list": ({"locked": ["joint_0.0"]}, "locked"),
+    "no contacts": ({"contacts": [3, 0]}, "contacts.1.*greater than or equal to 1"),
+    "negative contacts": ({"contacts": [-2]}, "contacts.0.*greater than or equal to 1"),
+    "contacts in excess": ({"contacts": 17 * [3]}, "contacts.*at most 16"),
     "empty name": ({"name": ""}, "name"),
     "name is a list": ({"name": ["a", "b"]}, "name"),
 }

@@ -102,6 +102,8 @@ BAD = {
         robot(A, B, C, joint("j", "a", "b", more=mimic("k")), joint("k", "b", "c", kind="fixed")),
         "'k'.*not a movable joint",
     ),
+    "mimic not a number": (robot(A, B, C, J, joint("k", "b", "c", more=mimic("j", "nan"))), "'k'.*multiplier nan"),
+    "mimic not finite": (robot(A, B, C, J, joint("k", "b", "c", more=mimic("j", '1" offset="inf'))), "'k'.*offset inf"),
     "no geometry": (robot(link("a", "<collision/>"), B, J), "without geometry|malformed"),
     "empty geometry": (robot(link("a", "<collision><geometry/></collision>"), B, J), "unknown collision|malformed"),
     "flat box": (robot(link("a", SHAPE.replace("0.06", "0")), B, J), "sizes must be positive"),

@@ -17,6 +17,7 @@ from lgrasp.scenes.render import (
     place_cameras,
     table_surface,
 )
+from lgrasp.scenes.schema import DEPTH_UNIT
 
 SIZE = 0.8
 RADIUS = 0.08
@@ -121,6 +122,17 @@ def test_noise_has_the_width_that_is_said(camera, pose, surface):
     assert abs(score.mean()) < 0.02
     assert abs(score.std() - 1) < 0.02
     assert (noisy.depth[~seen] == 0).all()
+
+
+def test_what_lies_deeper_than_a_file_can_hold_is_not_seen(camera, surface):
+    far = render(surface, camera, look_at(np.array([[0.1, 0.0, 6.6]]), np.zeros(3)))
+    noisy = add_noise(far, CameraParams(noise=0.0, noise_square=0.0), np.random.default_rng(0))
+    deep = far.depth > (2**16 - 1) * DEPTH_UNIT
+    assert set(far.labels[deep]) == {TABLE}
+    assert 7 in noisy.labels
+    assert (noisy.depth[deep] == 0).all()
+    assert (noisy.labels[deep] == NOTHING).all()
+    np.testing.assert_allclose(noisy.depth[~deep], far.depth[~deep], atol=DEPTH_UNIT)
 
 
 def test_offsets_are_of_one_length_in_any_direction():

@@ -58,7 +58,7 @@ def whole_export(out: Path) -> list[Path]:
     """
     try:
         known = {out / name for name in json.loads((out / INDEX).read_bytes())["files"]} | {out / INDEX}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return []
     there = _files(out)
     if other := sorted(path.name for path in there if path not in known):
@@ -126,7 +126,7 @@ def _interrupted(out: Path) -> str | None:
     """Key of the unfinished export that a folder holds, if it holds one."""
     try:
         return str(json.loads((out / UNFINISHED).read_bytes())["run_key"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

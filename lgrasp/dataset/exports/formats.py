@@ -138,9 +138,8 @@ def export_shards(
         if advance:
             advance(done, selection.rows)
 
-    if before:
-        remove(out, before)
-    begin(out, run_key)
+    begin(out, run_key)  # first: if what follows is killed, the same export can be gone on with
+    remove(out, before)
     try:
         write_assets(out, selection)
     except LgraspError:

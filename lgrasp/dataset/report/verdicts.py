@@ -40,8 +40,8 @@ class Verdicts:
     """Rows with a value and their sum, by further column."""
 
     def add(self, column: str, values: np.ndarray) -> None:
-        """Count one column, named without the protocol; values below 0 and NaN were not run."""
-        run = values >= 0  # NaN: false
+        """Count one column, named without the protocol; values below 0, NaN and infinite ones were not run."""
+        run = (values >= 0) & np.isfinite(values)
         if column in (_HOLDS, _OK) and values.ndim == 1:
             self.run += int(run.sum())
             self.held += int((values[run] > 0).sum())

@@ -42,8 +42,9 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
     """
     if out.exists() and not out.is_file():
         raise OutputError(f"report {out} cannot be written: it is no regular file; name another")
-    numbers, hands = read_dataset(paths, progress=progress)
-    write_file(out, page(numbers, hands, pictures(paths) if numbers["rows"] else ()))
+    heads, remarks = survey(paths)
+    numbers, hands = _read(heads, remarks, progress, near=True)
+    write_file(out, page(numbers, hands, pictures([head.path for head in heads]) if numbers["rows"] else ()))
     return numbers
 
 
@@ -73,7 +74,12 @@ def read_dataset(
     Raises:
         ShardError: No shard is found, or one cannot be read.
     """
-    heads, remarks = survey(paths)
+    return _read(*survey(paths), progress, near=near)
+
+
+def _read(
+    heads: Sequence[Head], remarks: Sequence[str], progress: Callable[[int, int], None] | None, *, near: bool
+) -> tuple[dict[str, Any], dict[tuple[str, str], HandRows]]:
     total, done, device = sum(head.rows for head in heads), 0, resolve_device().alias if near else None
     hands: dict[tuple[str, str], HandRows] = {}
     before = None

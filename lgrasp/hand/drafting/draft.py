@@ -116,8 +116,10 @@ def _with_shared(urdf: Urdf, survey: ContactSurvey, spec: HandSpec, decided: lis
     spread = [n for n in spread if _freed(urdf, spec, {n: (spec.locked[n],)}) is not None]
     by_name = free_joints(urdf)
     count = _SHARED_VALUES.get(len(spread), 0)
+    if count == 0:  # no such joint, or too many
+        return spec, decided
     shared = {n: _around(spec.locked[n], by_name[n].lower, by_name[n].upper, count) for n in spread}
-    free = _freed(urdf, spec, shared) if count else None
+    free = _freed(urdf, spec, shared)
     if free is None:
         return spec, decided
     decided = [line for line in decided if not any(line.startswith(f"joint '{n}' is locked") for n in shared)]

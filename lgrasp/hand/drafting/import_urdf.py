@@ -28,11 +28,11 @@ from lgrasp.hand.find import rules_of_known
 from lgrasp.hand.geometry import MOST_FACES, read_mesh, thin_mesh
 from lgrasp.hand.names import known_hands, name_of_file, slug
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
-from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, read_robot
-from lgrasp.paths import cache_dir, data_dirs, user_dir
+from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, joint_end, read_robot
+from lgrasp.paths import cache_dir, data_dirs, user_dir, user_path
 from lgrasp.words import listed
 
-_DRAFT_VERSION = 8
+_DRAFT_VERSION = 9
 FindMesh = Callable[[str, str], Path]  # (link, name in the URDF) -> file
 _LARGE_FILE = 5_000_000  # bytes of a mesh file that is worth looking into
 _FEW = 8  # links that are named
@@ -82,7 +82,7 @@ def import_urdf(
             raise HandError(
                 f"hand name '{name}' may hold letters, digits, '.', '_' and '-' only, such as '{slug(name)}'"
             )
-        folder = Path(out).expanduser() if out is not None else user_dir("hands") / name
+        folder = user_path(out) if out is not None else user_dir("hands") / name
         if os.path.lexists(folder) and not force:
             raise HandError(
                 f"hand folder {folder} exists; choose another --name or --out, or replace it with --overwrite"
@@ -168,7 +168,7 @@ def _take_couplings(robot: etree._Element, target: Path) -> list[str]:
     known = rules_of_known(target, [path.parent for path in _shipped_hands()])
     if known is None or not known.spec.mimic:
         return []
-    for joint in robot.iter("joint"):
+    for joint in robot.findall("joint"):
         if coupling := known.spec.mimic.get(joint.get("name", "")):
             etree.SubElement(joint, "mimic", {name: str(value) for name, value in coupling})
     _write(robot, target)
@@ -200,7 +200,7 @@ def _shipped_hands() -> list[Path]:
 
 def _joints(robot: etree._Element) -> tuple[set[str], set[str]]:
     """Names of the joints that move, and of those that mimic another."""
-    moving = [joint for joint in robot.iter("joint") if joint.get("type") in MOVABLE]
+    moving = [joint for joint in robot.findall("joint") if joint.get("type") in MOVABLE]
     return {j.get("name", "") for j in moving}, {j.get("name", "") for j in moving if j.find("mimic") is not None}
 
 
@@ -210,8 +210,8 @@ def _write(robot: etree._Element, path: Path) -> None:
 
 def _take_visuals(robot: etree._Element) -> list[str]:
     """Where no link has collision geometry, the visual geometry is it."""
-    visuals = list(robot.iter("visual"))
-    if robot.find(".//collision") is not None:
+    visuals = robot.findall("link/visual")
+    if robot.find("link/collision") is not None:
         return _ghosts(robot)
     if not visuals:
         return []
@@ -225,9 +225,9 @@ def _take_visuals(robot: etree._Element) -> list[str]:
 
 def _ghosts(robot: etree._Element) -> list[str]:
     """A note on links that joints move and that can be seen, but touch nothing."""
-    solid = {link.get("name", "") for link in robot.iter("link") if link.find("collision") is not None}
-    seen = {link.get("name", "") for link in robot.iter("link") if link.find("visual") is not None}
-    moved = [joint.find("child").get("link", "") for joint in robot.iter("joint") if joint.get("type") in MOVABLE]
+    solid = {link.get("name", "") for link in robot.findall("link") if link.find("collision") is not None}
+    seen = {link.get("name", "") for link in robot.findall("link") if link.find("visual") is not None}
+    moved = [joint_end(joint, "child") for joint in robot.findall("joint") if joint.get("type") in MOVABLE]
     ghosts = [link for link in moved if link in seen and not solid & {*_rigid(robot, link)}]
     if not ghosts:
         return []
@@ -240,9 +240,9 @@ def _ghosts(robot: etree._Element) -> list[str]:
 def _rigid(robot: etree._Element, link: str) -> Iterator[str]:
     """A link and those that are fixed to it, below."""
     yield link
-    for joint in robot.iter("joint"):
-        if joint.get("type") not in MOVABLE and joint.find("parent").get("link") == link:
-            yield from _rigid(robot, joint.find("child").get("link", ""))
+    for joint in robot.findall("joint"):
+        if joint.get("type") not in MOVABLE and joint_end(joint, "parent") == link:
+            yield from _rigid(robot, joint_end(joint, "child"))
 
 
 def _take_meshes(robot: etree._Element, folder: Path, find: FindMesh, originals: dict[Path, Path]) -> list[str]:
@@ -253,7 +253,7 @@ def _take_meshes(robot: etree._Element, folder: Path, find: FindMesh, originals:
     changes: list[str] = []
     for kind in ("collision", "visual"):
         copied: dict[Path, str] = {}
-        for element in list(robot.iter(kind)):
+        for element in robot.findall(f"link/{kind}"):
             for mesh in list(element.iter("mesh")):
                 link = element.getparent().get("name")
                 try:

@@ -91,10 +91,14 @@ class _Writer:
         self._files: dict[tuple[str, int], str] = {}
 
     def _top(self, root: str | None) -> int:
-        """The body that is the root link: ``root``, the one on the world that carries all joints, or the world."""
+        """The body that is the root link: ``root``, the one on the world that carries all joints, or the world.
+
+        Where nothing moves below ``root``, the file is taken whole: who cuts it can then name other links."""
         m = self._m
         if root is not None and (found := [b for b in range(m.nbody) if self._name("body", b) == root]):
-            return found[0]
+            below = self._below(found[0])[1:]
+            if any(m.jnt_bodyid[j] in below for j in self._moving):
+                return found[0]
         tops = {int(m.body_rootid[m.jnt_bodyid[j]]) for j in self._moving}
         alone = len(tops) == 1 and not any(m.jnt_bodyid[j] in tops for j in self._moving)
         return tops.pop() if alone else 0

@@ -19,7 +19,7 @@ def write_spec(spec: HandSpec, path: Path, decisions: list[str]) -> None:
     palm += [f"    - {_cone(c)}" for c in spec.palm.allowed]
     blocks = {
         "decisions": [f"# - {' '.join(line.split())}" for line in decisions],
-        "locked": _mapping("locked", {n: f"{v:g}" for n, v in spec.locked.items()}),
+        "locked": _mapping("locked", {n: _plain(v) for n, v in spec.locked.items()}),
         "shared": _mapping("shared", {n: _plain(list(v)) for n, v in spec.shared.items()}),
         "mimic": _mapping("mimic", {n: _plain(c.model_dump()) for n, c in spec.mimic.items()}),
         "contact": contact,

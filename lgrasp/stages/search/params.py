@@ -6,10 +6,8 @@ from pydantic import Field
 
 from lgrasp.choices import ScoreName
 from lgrasp.config import Params
-from lgrasp.math.limits import MAX_GROUPS
+from lgrasp.math.limits import MAX_GROUPS, MAX_KINDS
 
-MAX_KINDS = 16
-"""Most entries of ``contacts``."""
 MAX_RESTARTS = 4096
 """Most starts per pose."""
 

@@ -16,6 +16,8 @@ from lgrasp.hand.build import build_hand
 from lgrasp.hand.drafting.draft import draft_spec
 from lgrasp.hand.drafting.finger_structure import finger_structure, held_value
 from lgrasp.hand.drafting.import_urdf import import_urdf
+from lgrasp.hand.drafting.two_jaw import reroot
+from lgrasp.hand.drafting.write import write_spec
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import sample_bodies
 from lgrasp.hand.spec import load_spec
@@ -123,6 +125,31 @@ def test_jaws_with_one_drive_get_a_jaw_as_base(tmp_path):
     assert gaps == pytest.approx([0.0, 0.04, 0.1], abs=1e-6)
 
 
+def test_a_jaw_that_becomes_the_base_takes_no_name_that_is_there(tmp_path):
+    robot = etree.fromstring(gripper(tmp_path, mimic=True).read_bytes())
+    for name in ("jaw_l_mount", "l_mount"):
+        etree.SubElement(robot, "link", name=name)
+    reroot(robot, "jaw_l")
+    names = [part.get("name") for part in robot]
+    assert len(names) == len(set(names))
+
+
+OTHERS = (
+    '<transmission name="t"><joint name="l"><hardwareInterface>E</hardwareInterface></joint></transmission>'
+    '<gazebo reference="base"><collision><max_contacts>3</max_contacts></collision>'
+    '<visual><geometry><mesh filename="none.stl"/></geometry></visual></gazebo>'
+)
+
+
+@pytest.mark.usefixtures("no_spaces")
+def test_elements_of_other_tools_count_for_nothing(tmp_path):
+    """A transmission names joints again, and <gazebo> may say something about a collision."""
+    path = gripper(tmp_path, kind="visual")
+    path.write_text(path.read_text().replace("</robot>", f"{OTHERS}</robot>"))
+    made = import_urdf(path, out=tmp_path / "made")
+    assert any("visual geometry of 3 elements is used as collision" in line for line in made.decisions)
+
+
 @pytest.mark.usefixtures("no_spaces")
 def test_visual_geometry_stands_in(tmp_path):
     path = gripper(tmp_path, kind="visual")
@@ -142,7 +169,7 @@ def test_links_that_touch_nothing_are_told(tmp_path):
             collision.tag = "visual"
     cap = '<link name="cap"><collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
     held = '<joint name="cap" type="fixed"><parent link="b1"/><child link="cap"/></joint>'
-    path.write_bytes(etree.tostring(robot).replace(b"</robot>", (cap + held + "</robot>").encode()))
+    path.write_bytes(etree.tostring(robot).replace(b"</robot>", (cap + held + OTHERS + "</robot>").encode()))
     made = import_urdf(path, out=tmp_path / "made")
     told = [line for line in made.decisions if "no <collision>" in line]
     assert [line.split(":")[1] for line in told] == [" b0"]
@@ -259,6 +286,20 @@ def test_two_fingers_behind_a_spread_joint_are_two_where_a_third_opposes_them():
     assert structure.locked == ("finger_1_prox_joint",)
     assert [sorted(drives) for drives in structure.drives.values()] == [[f"finger_{n}_med_joint"] for n in (1, 2, 3)]
     assert structure.tree.groups == 3
+
+
+@pytest.mark.usefixtures("no_spaces")
+def test_more_spread_joints_than_can_be_shared_stay_locked(monkeypatch):
+    monkeypatch.setattr("lgrasp.hand.drafting.draft._SHARED_VALUES", {})
+    spec, _ = draft_spec(ROOT / "hands" / "barrett" / "hand.urdf", "drafted")
+    assert spec.shared == {}
+    assert set(spec.locked) == {"finger_1_prox_joint"}
+
+
+def test_locked_values_are_written_to_the_last_digit(allegro, tmp_path):
+    spec = allegro[0].model_copy(update={"locked": {"j": 1.5707963, "k": -1e-07}})
+    write_spec(spec, tmp_path / "hand.yaml", [])
+    assert load_spec(tmp_path / "hand.yaml").locked == spec.locked
 
 
 @pytest.mark.usefixtures("no_spaces")

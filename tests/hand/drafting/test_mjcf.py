@@ -283,3 +283,5 @@ def test_one_hand_of_a_scene(tmp_path):
     assert {link for rule in made.spec.contact for link in rule.links} == {"R_jaw_l", "R_jaw_r"}
     with pytest.raises(HandError, match=rf"MJCF {scene} has no link 'R_bas'; did you mean 'R_base'"):
         import_urdf(scene, root="R_bas", mesh_dirs=[tmp_path / "parts"], out=tmp_path / "no")
+    with pytest.raises(HandError, match=r"no joint moves what is below link 'R_jaw_l'; links: world, L_base"):
+        import_urdf(scene, root="R_jaw_l", mesh_dirs=[tmp_path / "parts"], out=tmp_path / "no")
