@@ -348,10 +348,8 @@ def _joint(path: Path, element: etree._Element, links: dict[str, tuple[Geometry,
             factor, offset = (_number(path, where, source, *x) for x in (("multiplier", "1"), ("offset", "0")))
             mimic = (source.get("joint", ""), factor, offset)
             if not (math.isfinite(factor) and math.isfinite(offset)):
-                raise HandError(
-                    f"URDF {path}: {where} has mimic multiplier {factor:g} and offset {offset:g}; finite numbers are "
-                    "needed"
-                )
+                wrong = f"mimic multiplier {factor:g} and offset {offset:g}"
+                raise HandError(f"URDF {path}: {where} has {wrong}; finite numbers are needed")
     origin = _origin(path, where, element)
     turns, slides = kind == "continuous", kind == "prismatic"
     return Joint(name, parent, child, origin, movable, slides, axis, lower, upper, mimic, effort, turns)

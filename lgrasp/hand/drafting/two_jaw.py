@@ -70,7 +70,7 @@ def reroot(robot: etree._Element, link: str) -> None:
             joint.find("child").set("link", parent)
             set_origin(joint, *back)
             continue
-        mount = _free_name(robot, f"{child}_mount")
+        mount = _free_name(robot, "link", f"{child}_mount")
         robot.append(etree.Element("link", name=mount))
         joint.find("child").set("link", mount)
         set_origin(joint, np.zeros(3), Rotation.identity())
@@ -78,15 +78,16 @@ def reroot(robot: etree._Element, link: str) -> None:
         if axis is None:
             axis = etree.SubElement(joint, "axis", xyz="1 0 0")
         axis.set("xyz", number_text(-numbers(axis, "xyz", "1 0 0")))
-        fixed = etree.SubElement(robot, "joint", name=_free_name(robot, f"{joint.get('name')}_mount"), type="fixed")
+        name = _free_name(robot, "joint", f"{joint.get('name')}_mount")
+        fixed = etree.SubElement(robot, "joint", name=name, type="fixed")
         etree.SubElement(fixed, "parent", link=mount)
         etree.SubElement(fixed, "child", link=parent)
         set_origin(fixed, *back)
 
 
-def _free_name(robot: etree._Element, name: str) -> str:
-    """``name``, or one like it that no link or joint has."""
-    taken = {part.get("name") for part in (*robot.findall("link"), *robot.findall("joint"))}
+def _free_name(robot: etree._Element, kind: str, name: str) -> str:
+    """``name``, or one like it that no link, or no joint, has."""
+    taken = {part.get("name") for part in robot.findall(kind)}
     while name in taken:
         name += "_"
     return name

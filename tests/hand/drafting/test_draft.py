@@ -127,10 +127,10 @@ def test_jaws_with_one_drive_get_a_jaw_as_base(tmp_path):
 
 def test_a_jaw_that_becomes_the_base_takes_no_name_that_is_there(tmp_path):
     robot = etree.fromstring(gripper(tmp_path, mimic=True).read_bytes())
-    for name in ("jaw_l_mount", "l_mount"):
-        etree.SubElement(robot, "link", name=name)
+    etree.SubElement(robot, "link", name="jaw_l_mount")
+    etree.SubElement(robot, "joint", name="l_mount")
     reroot(robot, "jaw_l")
-    names = [part.get("name") for part in robot]
+    names = [(part.tag, part.get("name")) for part in robot]
     assert len(names) == len(set(names))
 
 
