@@ -246,6 +246,12 @@ def test_names_must_differ():
         new_table(config(objects=("mug", "other/mug.obj")), repeat=1, baseline_rows=1)
 
 
+def test_a_folder_stands_for_its_objects(tmp_path):
+    for name in ("mug", "cup"):
+        (tmp_path / f"{name}.stl").touch()
+    assert new_table(config(objects=(str(tmp_path),)), repeat=1, baseline_rows=1)["objects"] == ["cup", "mug"]
+
+
 def test_folders_come_first(tmp_path, job):
     (tmp_path / "allegro").mkdir()
     (tmp_path / "allegro" / "allegro.urdf").touch()

@@ -186,9 +186,13 @@ def test_prune(cache):
     files, size = cache.prune({"bank"})
     assert (files, size > 0) == (1, True)
     assert not left.exists()
-    assert cache.prune(older_than=0.0) == (0, 0)
-    assert cache.prune()[0] == 1
+    variant = cache.root / "variants" / "key" / "hand" / "hand.urdf"
+    variant.parent.mkdir(parents=True)
+    variant.write_text("<robot/>")
+    assert cache.prune(older_than=0.0) == cache.prune({"field"}) == (0, 0)
+    assert cache.prune()[0] == 2
     assert not cache.entries()
+    assert not variant.exists()
 
 
 def test_prune_leaves_kernels_that_are_being_compiled(cache):

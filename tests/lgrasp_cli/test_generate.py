@@ -72,6 +72,15 @@ def test_table(generate, tmp_path):
     assert sorted(set(read_shard(path).grasps.table["pose"].tolist())) == [k for k, p in enumerate(poses) if p["rows"]]
 
 
+def test_what_is_overwritten_is_not_asked_any_more(cli, generate, tmp_path):
+    """Parts of the run before that were never made are no part of the folder."""
+    assert generate("--shard-rows", 5, "--array", "0/4").code == 0
+    assert generate("--seed", 3, "--overwrite").code == 0
+    (run,) = json.loads(cli("status", tmp_path / "out", "--json", "-").out)
+    assert (run["seed"], run["state"]) == (3, "complete")
+    assert cli("dataset", "check", tmp_path / "out").out == "1 shard valid\n"
+
+
 def test_negatives(cli, generate, tmp_path):
     """The same grasps, and after them rows that fail the bound that they name; only the first count as grasps."""
     assert generate().code == 0

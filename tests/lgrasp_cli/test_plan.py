@@ -91,6 +91,7 @@ def test_cloud_is_stored(cli, cloud, tmp_path):
         (["--object", "sphere", "--stand-off", "nan"], "'stand_off' = nan: Input should be"),
         (["--object", "sphere", "--stand-off", 0], "'stand_off' = 0.0: Input should be greater than 0"),
         (["--object", "sphere", "--stand-off", 50], "'stand_off' = 50.0: Input should be less than or equal to 1"),
+        (["--object", "sphere", "--model", "grasp-allegro", "--stand-off", 0.1], "a network draws its own"),
         (["--object", "sphere", "--hand", "baret"], "did you mean 'barrett'"),
         (["--object", "spere"], "did you mean sphere"),
         (["--object", "sphere", "--scale", 1000], "is accepted"),

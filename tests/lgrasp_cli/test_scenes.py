@@ -47,6 +47,16 @@ def test_make_check_info(cli, config):
     assert str(path) in broken.err
 
 
+def test_a_dry_run_generates_no_grasps(cli, config):
+    """Not even where scenes are there, whose key is that of the grasps."""
+    assert cli("scenes", "make", config(job="scenes"), "-n", 1).code == 0
+    before = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*.h5")}
+    plan = cli("run", config(job="scenes", stock=20), "--dry-run")
+    assert plan.code == 0, plan
+    assert [line.split()[2] for line in plan.out.splitlines()[1:]] == ["present", "missing"]
+    assert {path: path.stat().st_mtime_ns for path in Path("out").rglob("*.h5")} == before
+
+
 def test_options_replace_the_config(cli, config):
     result = cli("scenes", "make", config(), "--on-table", 1, "--views", 1, "-n", 1, "--out", "other", "--json", "-")
     data = json.loads(result.out)
@@ -60,11 +70,12 @@ def test_options_replace_the_config(cli, config):
         ({"sceens": 3}, "unknown key 'sceens'; did you mean 'scenes'?"),
         ({"scene": {"camera": {"elevation": [80, 20]}}}, "the smaller number of a range comes first"),
         ({"scenes": 0}, "key 'scenes' = 0"),
+        ({"scene": 5}, "key 'scene' = 5"),
         ({"hand": "nohand"}, "nohand"),
     ],
 )
 def test_bad_configs(cli, config, changes, words):
-    assert words in cli("scenes", "make", config(**changes)).error()
+    assert words in cli("scenes", "make", config(**changes), "--on-table", 1).error()
 
 
 def test_bad_options(cli, config):

@@ -81,6 +81,12 @@ WRONG = {
 }
 
 
+def test_plans_are_submitted(cli, sbatch):
+    """Whose one file is named by a hand and an object that are not built yet."""
+    shown = cli("submit", "--dry-run", "--", "plan", "--object", "tiny", "--starts", 2)
+    assert (shown.code, shown.err) == (0, "")
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_what_cannot_run_is_not_submitted(cli, sbatch, tmp_path, name):
     words, reason = WRONG[name]
