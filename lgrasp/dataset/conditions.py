@@ -16,6 +16,8 @@ _VALID = "metrics/valid"
 _OPERATORS: dict[str, np.ufunc] = {">=": np.greater_equal, "<=": np.less_equal, "==": np.equal, "!=": np.not_equal}
 _OPERATORS |= {">": np.greater, "<": np.less}
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_INTEGER = re.compile(r"[-+]?\d{1,20}", re.ASCII)
+"""Compared as such: float64 cannot tell large ones apart."""
 _PATTERN = re.compile(rf"\s*([\w/.-]+?)\s*(?:({'|'.join(_OPERATORS)})\s*({_NUMBER})\s*)?", re.ASCII)
 
 
@@ -27,7 +29,10 @@ class Condition(NamedTuple):
     value: float = 0.0
 
     def __str__(self) -> str:
-        return self.column if self[1:] == ("!=", 0.0) else f"{self.column} {self.operator} {self.value:g}"
+        if self[1:] == ("!=", 0.0):
+            return self.column
+        short = f"{self.value:g}"
+        return f"{self.column} {self.operator} {short if float(short) == self.value else repr(self.value)}"
 
     def holds(self, reader: ShardReader) -> np.ndarray:
         """Which rows satisfy it, bool, shape [N]; a NaN satisfies nothing.
@@ -72,4 +77,6 @@ def parse_condition(text: str) -> Condition:
     if match is None:
         raise ConfigError(f"--where '{text}': expected COLUMN or COLUMN OP NUMBER, such as 'metrics/epsilon > 0.01'")
     column, sign, number = match.groups()
-    return Condition(column, sign, float(number)) if sign else Condition(column)
+    if not sign:
+        return Condition(column)
+    return Condition(column, sign, int(number) if _INTEGER.fullmatch(number) else float(number))

@@ -93,8 +93,12 @@ def measured_in(target: Path, source: Path) -> dict[str, str] | None:
         return None
     with ShardReader(source) as old, ShardReader(target) as new:
         mine, theirs = ({**reader.attributes, "text_sha256": ""} for reader in (old, new))
-        if mine != theirs or not all(
-            np.array_equal(old.column(name), new.column(name), equal_nan=name != "candidate") for name in _ROW
+        if (
+            mine.keys() != theirs.keys()
+            or not all(np.array_equal(mine[name], theirs[name]) for name in mine)  # some may be arrays
+            or not all(
+                np.array_equal(old.column(name), new.column(name), equal_nan=name != "candidate") for name in _ROW
+            )
         ):
             raise OutputError(f"{target} holds other rows than {source}; choose another --out, or --overwrite")
         return measured_with(new)

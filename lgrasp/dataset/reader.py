@@ -190,8 +190,8 @@ class ShardReader(FileReader):
 
     @cached_property
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
-        """Shape and dtype of every row dataset by its flat name (``q``, ``metrics/gap``, ...), in the byte order of this
-        computer."""
+        """Shape, and dtype in the byte order of this computer, of every row dataset by its flat name (``q``,
+        ``metrics/gap``, ...)."""
         names = [*GRASP_FIELDS, *(SEQUENCE_FIELDS if self.space_names is not None else ())]
         names += TABLE_FIELDS if "grasps/table" in self._nodes else ()
         for path in (path for group in ("metrics", "physics") for path in expand(self._nodes, f"grasps/{group}/*")):

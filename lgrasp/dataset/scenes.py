@@ -13,7 +13,7 @@ import numpy as np
 from lgrasp.dataset.conditions import Condition, parse_condition, satisfied
 from lgrasp.dataset.files import Paths, check_heaps
 from lgrasp.dataset.gather import sound_files
-from lgrasp.dataset.reader import ShardReader, count_rows
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
@@ -47,7 +47,7 @@ class SceneRows:
     """
 
     def __init__(self, paths: Paths) -> None:
-        found = sound_files(paths, count_rows)
+        found = sound_files(paths, _count)
         self.files = [file for file, _, _ in found]
         self._ends = list(accumulate(rows for _, _, rows in found))
         if not len(self):
@@ -259,6 +259,12 @@ def draw_motion(
 def _when(path: Path) -> int:
     """When a file was written [ns]: verdicts may be added to it while its rows are shown."""
     return path.stat().st_mtime_ns if path.exists() else 0
+
+
+def _count(path: Path) -> int:
+    """Rows of a shard that can be looked at."""
+    with ShardReader(path) as reader:
+        return len(satisfied(reader, ()))
 
 
 def _row(path: Path, number: int, _: int) -> GraspRows:

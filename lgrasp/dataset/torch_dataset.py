@@ -66,7 +66,7 @@ class TorchRows:
         found = [shard.value for shard in gather(paths, self._survey, invalid=negatives)]
         self._sources = [source for source in found if source.rows] if self._split else found
         if not self._sources:
-            raise ShardError(f"{found[0].path}: no row is in part '{part}' of the split ({len(found)} shards)")
+            raise ShardError(f"{found[0].path}: no row is in part '{self._part}' of the split ({len(found)} shards)")
         tell_differences(paths)
         first = self._sources[0]
         for source in self._sources:

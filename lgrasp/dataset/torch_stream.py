@@ -58,6 +58,8 @@ class GraspIterableDataset(TorchRows, torch.utils.data.IterableDataset):
                 f"rank={self._rank}, ranks={self._ranks}, batch={batch}, buffer={buffer}: ranks count from 0, "
                 "batch and buffer are 0 or more"
             )
+        if not self.columns:
+            raise ValueError("columns=[]: name at least one, or leave columns out for all")
         self._batch, self._buffer, self._seed = batch, buffer, seed
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # worker processes that stay see it too
 

@@ -11,7 +11,7 @@ from support.wrench import cone_forces, epsilon, residual, wrenches
 from typer.testing import CliRunner
 
 from lgrasp.config import parse_model
-from lgrasp.dataset.metrics import mass_frame, row_metrics
+from lgrasp.dataset.metrics import mass_frame, measured_in, row_metrics
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.report.write import read_dataset
 from lgrasp.dataset.validate import validate_shard
@@ -188,6 +188,15 @@ def test_resume(tmp_path, make_shard):
     write_shard(tmp_path / "in" / "sub" / "0.h5", make_shard(2, seed=9))
     with pytest.raises(OutputError, match=r"0\.h5 holds other rows than .*choose another --out"):
         add_metrics(tmp_path / "in", out, BOTH, workers=1)
+
+
+def test_attributes_of_other_writers_may_be_arrays(tmp_path, make_shard):
+    for name in ("a.h5", "b.h5"):
+        write_shard(tmp_path / name, make_shard(2))
+        with h5py.File(tmp_path / name, "r+") as file:
+            file.attrs["bias"] = [1.0, 2.0]
+            del file.attrs["text_sha256"]
+    assert measured_in(tmp_path / "a.h5", tmp_path / "b.h5") == {}
 
 
 def test_a_copy_keeps_what_was_measured(tmp_path, make_shard):

@@ -1,7 +1,9 @@
 """Rows of many shards as one list of scenes."""
 
+import shutil
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from support.jaws import jaw_rows, jaw_shard
@@ -33,6 +35,15 @@ def test_rows_are_counted_through_all_shards(folder):
     assert rows.place(3) == (folder / "b" / "b.h5", 0)
     opening = [float(rows.scene(row).steps[0].stages["pregrasp"][0]) for row in range(5)]
     np.testing.assert_allclose(opening, [0.03] * 3 + [0.04] * 2, atol=1e-6)
+
+
+def test_a_shard_that_cannot_be_used_is_left_out(folder, said):
+    shutil.copy(folder / "a" / "a.h5", folder / "a" / "bad.h5")
+    with h5py.File(folder / "a" / "bad.h5", "r+") as file:
+        del file["grasps/contact_links"]
+    assert SceneRows(folder).spread(9) == [0, 1, 2, 3, 4]
+    assert len(said) == 1
+    assert "1 of 3 files are left out" in said[0]
 
 
 def test_spread_is_even_and_complete(folder):

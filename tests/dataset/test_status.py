@@ -10,6 +10,7 @@ from support.jobs import SampleJob, StopAfter
 from support.shards import sample_shard
 from typer.testing import CliRunner
 
+from lgrasp.dataset.manifest import ListedRun, Manifest
 from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.writer import write_shard
@@ -112,6 +113,12 @@ def test_check(tmp_path, said):
     result = call("dataset", "check", tmp_path)
     assert result.exit_code == 2
     assert result.stderr.startswith(f"{tmp_path / 'manifest.json'}: not a manifest of shards")
+
+
+def test_a_run_without_shards_is_nothing(tmp_path):
+    """As another program may list it."""
+    (tmp_path / "manifest.json").write_text(Manifest(runs=[ListedRun(run_key="a")]).model_dump_json())
+    assert len(run(SampleJob(out=tmp_path)).written) == 3
 
 
 def test_a_shard_that_came_after_the_manifest(tmp_path):

@@ -2,6 +2,7 @@ import multiprocessing
 import pickle
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -60,6 +61,16 @@ def test_rows_that_fail_a_bound_are_left_out(tmp_path, make_sequence):
         assert torch.equal(data[place]["q"], every[int(row)]["q"])
         old, new = int(rows.sequence.parent[row]), int(data[place]["sequence/parent"])
         assert new == -1 if old == -1 else taken[new] == old
+
+
+def test_numbers_of_either_byte_order(tmp_path, make_shard):
+    write_shard(tmp_path / "a.h5", make_shard(5))
+    q = read_shard(tmp_path / "a.h5").grasps.q
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        told = dict(file["grasps/q"].attrs)
+        del file["grasps/q"]
+        file.create_dataset("grasps/q", data=q.astype(">f4")).attrs.update(told)
+    np.testing.assert_array_equal(GraspDataset(tmp_path)[2]["q"], q[2])
 
 
 def test_default_collate_with_two_workers(folder):

@@ -52,6 +52,8 @@ def test_every_row_once_an_epoch(folder, buffer):
     assert numbers(data) == found
     data.set_epoch(1)
     assert (numbers(data) == found) == (buffer == 0)
+    with pytest.raises(ValueError, match="name at least one"):
+        GraspIterableDataset(folder, columns=[])
     assert (numbers(GraspIterableDataset(folder, columns=["candidate"], buffer=buffer, seed=4)) == found) == (
         not buffer
     )
@@ -159,9 +161,12 @@ def test_split_errors(folder, tmp_path, make_shard):
     with pytest.raises(ShardError, match="object 'cup' is in no part"):
         GraspDataset(tmp_path / "new.h5", split=made)
     (tmp_path / "x.json").write_text("{}")
-    for path, words in ((tmp_path / "none.json", "No such file"), (tmp_path / "x.json", "dataset split writes one")):
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    for name, words in (("none", "No such file"), ("x", "split writes one"), ("deep", "split writes one")):
         with pytest.raises(ConfigError, match=words):
-            GraspDataset(folder, split=path)
+            GraspDataset(folder, split=tmp_path / f"{name}.json")
+    with pytest.raises(ShardError, match="no row is in part 'train'"):
+        GraspDataset(folder / "3.h5", split=made)
 
 
 def test_normalisation(folder, tmp_path):

@@ -92,6 +92,32 @@ def test_it_stands_alone(tmp_path):
     assert "1 of 1 judged rows" in result.stdout
 
 
+def test_each_file_is_judged_once(tmp_path):
+    """Also one that two paths name; links to folders are followed."""
+    path = write_shard(tmp_path / "data" / "a.h5", [row()])
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "data").symlink_to(path.parent)
+    (path.parent / "round").symlink_to(path.parent)
+    assert len(judge([tmp_path / "linked", path, os.path.relpath(path)]).shards) == 1
+
+
+def test_findings_go_where_they_are_asked(tmp_path):
+    """Into new folders, through links and into pipes; nothing else is touched."""
+    shard = write_shard(tmp_path / "good.h5", [row()])
+    (tmp_path / "kept.json.tmp").write_text("mine")
+    (tmp_path / "link.json").symlink_to(tmp_path / "kept.json")
+    for name in ("link.json", "new/folder/out.json"):
+        assert run(shard, "-q", "--json", tmp_path / name).exit_code == 0
+        assert json.loads((tmp_path / name).read_text())["rows"] == 1
+    assert (tmp_path / "link.json").resolve() == tmp_path / "kept.json"
+    assert (tmp_path / "kept.json.tmp").read_text() == "mine"
+    os.mkfifo(tmp_path / "pipe")
+    end = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    assert run(shard, "-q", "--json", tmp_path / "pipe").exit_code == 0
+    assert json.loads(os.read(end, 1 << 16))["rows"] == 1
+    os.close(end)
+
+
 def _damage(name):
     def change(path: Path) -> None:
         with h5py.File(path, "r+") as f:

@@ -28,7 +28,7 @@ def check_empty(out: Path, run_key: str = "") -> None:
     rule = "--out needs an empty folder, or one that does not exist"
     try:
         remove_leftovers(out, f"{Path(UNFINISHED).stem}.*.tmp")
-        if run_key and _interrupted(out) == run_key:
+        if _is_own(out, run_key):
             return
         for first in sorted(path.name for path in out.iterdir()):
             raise OutputError(f"{out} is not empty (it holds {first}); {rule}")
@@ -50,25 +50,27 @@ UNFINISHED = "unfinished.json"
 _FEW = 8  # names in the README
 
 
-def whole_export(out: Path) -> list[Path]:
-    """The files of the whole export that a folder holds; none if it holds none.
+def whole_export(out: Path, run_key: str) -> list[Path]:
+    """The files of the whole export that a folder holds, or what an interrupted export with the key of this one has
+    left of it; none if it holds none.
 
     Raises:
         OutputError: It holds other files, too.
     """
-    try:
-        known = {out / name for name in json.loads((out / INDEX).read_bytes())["files"]} | {out / INDEX}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    listed = _told(out / INDEX).get("files") or (_is_own(out, run_key) and _told(out / UNFINISHED).get("files"))
+    if not isinstance(listed, list):
         return []
+    remove_leftovers(out, f"{Path(UNFINISHED).stem}.*.tmp")
+    known = {out / str(name) for name in [*listed, INDEX, UNFINISHED]}
     there = _files(out)
     if other := sorted(path.name for path in there if path not in known):
         raise OutputError(f"{out} holds {other[0]}, which is not of the export; move it, or choose another --out")
-    return there
+    return [path for path in there if path != out / UNFINISHED]
 
 
 def remove(out: Path, files: Sequence[Path]) -> None:
-    """Remove all files of a folder, and the folders in it."""
-    for path in files:
+    """Remove files of a folder, the index first, and the folders in it."""
+    for path in sorted(files, key=lambda path: path != out / INDEX):
         path.unlink()
     for folder in sorted((path for path in out.rglob("*") if path.is_dir()), reverse=True):
         folder.rmdir()
@@ -106,13 +108,17 @@ def mesh_text(mesh: Trimesh, **options: Any) -> str:
     return export_obj(mesh, include_normals=False, include_texture=False, digits=9, **options)
 
 
-def begin(out: Path, run_key: str) -> None:
+def begin(out: Path, run_key: str, before: Sequence[Path] = ()) -> None:
     """Mark a folder as that of an unfinished export.
+
+    Args:
+        before: Files of a whole export, which are going to be removed.
 
     Raises:
         OutputError: The folder cannot be written.
     """
-    write_file(out / UNFINISHED, json.dumps({"run_key": run_key}))
+    files = {"files": [path.relative_to(out).as_posix() for path in before]} if before else {}
+    write_file(out / UNFINISHED, json.dumps({"run_key": run_key, **files}))
 
 
 def abandon(out: Path) -> None:
@@ -122,12 +128,18 @@ def abandon(out: Path) -> None:
         out.rmdir()
 
 
-def _interrupted(out: Path) -> str | None:
-    """Key of the unfinished export that a folder holds, if it holds one."""
+def _is_own(out: Path, run_key: str) -> bool:
+    """True if a folder holds an unfinished export with this key, which is not empty."""
+    return bool(run_key) and _told(out / UNFINISHED).get("run_key") == run_key
+
+
+def _told(path: Path) -> dict[str, Any]:
+    """What a JSON file holds; nothing if it cannot be read."""
     try:
-        return str(json.loads((out / UNFINISHED).read_bytes())["run_key"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def write_index(

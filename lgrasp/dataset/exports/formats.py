@@ -121,7 +121,7 @@ def export_shards(
     to = to.replace("_", "-")
     form, conditions, out = _format(to), [parse_condition(text) for text in where], Path(out)
     check_options(to, split, licence)
-    before = whole_export(out) if replaces else []
+    before = whole_export(out, run_key) if replaces else []
     if not before:
         check_empty(out, run_key)
     parts = Split.read(split) if split is not None else None
@@ -138,8 +138,10 @@ def export_shards(
         if advance:
             advance(done, selection.rows)
 
-    begin(out, run_key)  # first: if what follows is killed, the same export can be gone on with
-    remove(out, before)
+    if before:
+        begin(out, run_key, before)
+        remove(out, before)
+    begin(out, run_key)
     try:
         write_assets(out, selection)
     except LgraspError:

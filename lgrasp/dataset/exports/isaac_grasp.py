@@ -20,7 +20,7 @@ grasps/CODE.yaml   isaac_grasp format, version 1.0: all grasps of one object by 
 
   object_frame_link, gripper_frame_link    the object's mesh frame, and link {base} of hand/hand.urdf. NVIDIA's pages
                    call them object_frame and gripper_frame as well; both are given.
-  confidence       1.0; 0.0 where a simulator saw the grasp fail
+  confidence       1.0; 0.0 where a simulator saw the grasp fail, or metric valid is 0
   position         x y z [m] of {base} in the object's frame
   orientation      w and xyz of its quaternion, unit, w >= 0
   cspace_position  joints at the grasp by name [rad or m]

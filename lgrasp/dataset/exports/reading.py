@@ -67,8 +67,12 @@ def order_of(names: Sequence[str], wanted: Sequence[str], where: object) -> list
     """Place in ``names`` of each wanted joint.
 
     Raises:
-        ShardError: The two do not name the same joints.
+        ShardError: The two do not name the same joints, or one of them twice.
     """
+    for given in (names, wanted):
+        if len(set(given)) < len(given):
+            twice = next(name for name in given if list(given).count(name) > 1)
+            raise ShardError(f"{where}: joint {twice!r} is named twice, expected once")
     if sorted(names) != sorted(wanted):
         lacking = sorted(set(wanted) - set(names))
         other = f"lacks joint {lacking[0]!r}" if lacking else f"has joint {sorted(set(names) - set(wanted))[0]!r}"
@@ -168,9 +172,13 @@ class ExportFolder:
 
 
 def objects_beside(path: Path) -> Path:
-    """Where the meshes of objects are that grasps in a folder or file name: ``objects`` beside ``grasps``."""
+    """Where the meshes of objects are that grasps in a folder or file name: ``objects`` there, or beside the nearest
+    ``grasps`` that it is in."""
     folder = path if path.is_dir() else path.parent
-    return (folder.parent if folder.name == GRASPS else folder) / OBJECTS
+    if folder.name != GRASPS and (folder / OBJECTS).is_dir():
+        return folder / OBJECTS
+    above = folder.absolute()
+    return next((at.parent for at in (above, *above.parents) if at.name == GRASPS), folder) / OBJECTS
 
 
 def open_folder(path: Path | str, suffix: str, layout: str, wanted: Sequence[str] | None) -> ExportFolder:

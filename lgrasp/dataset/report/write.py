@@ -44,7 +44,7 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
         raise OutputError(f"report {out} cannot be written: it is no regular file; name another")
     heads, remarks = survey(paths)
     numbers, hands = _read(heads, remarks, progress, near=True)
-    write_file(out, page(numbers, hands, pictures([head.path for head in heads]) if numbers["rows"] else ()))
+    write_file(out, page(numbers, hands, pictures(sorted(head.path for head in heads)) if numbers["rows"] else ()))
     return numbers
 
 

@@ -139,6 +139,13 @@ grasps:
 """
 
 
+def test_a_part_of_an_export_knows_its_meshes(tmp_path, shards):
+    shards.make(tmp_path / "a.h5", n=2)
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "dexgraspbench")
+    for path in (grasps := tmp_path / "out" / "grasps", grasps / "cup", grasps / "cup" / "00000000.npy"):
+        assert [item.mesh for item in read_dexgraspbench(path).objects] == [tmp_path / "out" / "objects" / "cup.obj"]
+
+
 def test_others_isaac_grasp(tmp_path):
     (tmp_path / "mug.yaml").write_text(ISAAC)
     read = read_isaac_grasp(tmp_path / "mug.yaml")
@@ -170,6 +177,7 @@ def test_others_isaac_grasp(tmp_path):
         ({"obj_pose": np.zeros(3)}, "obj_pose has 3 numbers, expected 7"),
         ({"grasp_qpos": np.full(9, np.nan)}, "grasp_qpos is not finite"),
         ({"joint_names": ["a", "c"]}, "lacks joint 'b'"),
+        ({"joint_names": ["a", "a"]}, "joint 'a' is named twice"),
         ({"obj_path": 3}, "obj_path is 3"),
         ({"obj_scale": "big"}, "scale holds no numbers"),
         ({"obj_scale": np.nan}, "scale is not finite"),

@@ -1,8 +1,10 @@
 """Which rows are exported, and what is refused."""
 
 import json
+import os
 import tarfile
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -14,6 +16,7 @@ from pxr import Usd
 from lgrasp.dataset.conditions import Condition, parse_condition
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.dataset.exports.npy import load_objects
+from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ConfigError, LgraspError, OutputError, ShardError
 from lgrasp.geometry.poses import pose_matrix
@@ -111,6 +114,45 @@ def test_conditions_are_read(text, condition):
 def test_conditions_that_cannot_be_read(text):
     with pytest.raises(ConfigError, match="--where"):
         parse_condition(text)
+
+
+def test_conditions_on_large_numbers(tmp_path, shards):
+    """They are compared, and told, to the last digit."""
+    shard = shards.make(tmp_path / "a.h5", n=3)
+    rows = replace(shard.grasps, candidate=np.array([2**53, 2**53 + 1, 7], np.uint64))
+    write_shard(tmp_path / "a.h5", replace(shard, grasps=rows))
+    with ShardReader(tmp_path / "a.h5") as reader:
+        for text in ("candidate == 9007199254740993", "metrics/epsilon > 0.123456789", "candidate < 0.5"):
+            assert str(parse_condition(text)) == text
+        assert parse_condition("candidate == 9007199254740993").holds(reader).tolist() == [False, True, False]
+        assert parse_condition("candidate >= -1").holds(reader).all()
+
+
+def test_an_export_killed_while_it_replaces_another_is_gone_on_with(tmp_path, shards, monkeypatch):
+    shards.make(tmp_path / "a.h5", n=4, objects=[shards.object("jug")])
+    shards.make(tmp_path / "b.h5", n=3)
+    again = {"run_key": "b", "replaces": True}
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "dexgraspbench", run_key="a")
+    removed: list[Path] = []
+
+    def unlink(path: Path, missing_ok: bool = False) -> None:
+        removed.append(path)
+        if len(removed) == 3:
+            raise KeyboardInterrupt
+        os.remove(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", unlink)
+        with pytest.raises(KeyboardInterrupt):
+            export_shards(tmp_path / "b.h5", tmp_path / "out", "dexgraspnet", **again)
+    with pytest.raises(ShardError, match="the export is incomplete"):
+        read_grasps(tmp_path / "out", "dexgraspbench")
+    with pytest.raises(OutputError, match="is not empty"):
+        export_shards(tmp_path / "b.h5", tmp_path / "out", "dexgraspnet", run_key="c", replaces=True)
+    export_shards(tmp_path / "b.h5", tmp_path / "out", "dexgraspnet", **again)
+    export_shards(tmp_path / "b.h5", tmp_path / "fresh", "dexgraspnet", **again)
+    out, fresh = (sorted(p.relative_to(top) for p in top.rglob("*")) for top in (tmp_path / "out", tmp_path / "fresh"))
+    assert out == fresh
 
 
 def several(shards, path):

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -83,8 +84,11 @@ def make(tmp_path):
     return make
 
 
-def test_generated_grasps(run, make, tmp_path, grasps):
+def test_generated_grasps(run, make, tmp_path, grasps, said):
+    """Copies of shards are left out of all parts of the page."""
     run(rows=60, shard_rows=30)
+    (tmp_path / "out" / "copy").mkdir()
+    shutil.copy(next((tmp_path / "out").glob("*.h5")), tmp_path / "out" / "copy")
     seen = []
     numbers, text = make(tmp_path / "out", progress=lambda *now: seen.append(now))
     assert seen == [(30, 60), (60, 60)]
@@ -263,6 +267,7 @@ def test_hold_test(make, make_shard, tmp_path):
     shard = make_shard(30)
     share = np.linspace(0.0, 1.0, 30).astype("f4")
     metrics = {"hold_success": (share > 0.5).astype("f4"), "hold_probability": share, "hold_drift": np.full(30, 0.25)}
+    metrics["hold_drift"][7] = np.inf  # no distance: left out
     held = replace(shard.grasps, metrics=shard.grasps.metrics | {k: v.astype("f4") for k, v in metrics.items()})
     held = replace(held, metric_units=held.metric_units | dict.fromkeys(metrics, "1"))
     write_shard(tmp_path / "a.h5", replace(shard, grasps=held))
