@@ -83,7 +83,7 @@ def test_hand_without_spaces(sequence, tmp_path):
 
 def test_object_that_no_space_can_hold(sequence, tmp_path):
     """A ball as large as the hand: which object, which spaces, and why."""
-    line = sequence("sphere", "mug", "--scale", "0.4:0.4", "-n", "1", "-q").error()
+    line = sequence("sphere", "mug", "--scale", "0.4:0.4", "-n", "1", "-q").error(3)
     assert "object 1" in line
     assert "sphere" in line
     assert "400 x 400 x 400 mm" in line

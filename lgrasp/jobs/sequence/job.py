@@ -10,7 +10,7 @@ import numpy as np
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import Found
-from lgrasp.errors import LgraspError, ObjectError, StarvedError
+from lgrasp.errors import LgraspError, StarvedError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.sequences import SequenceTable
@@ -138,7 +138,7 @@ class SequenceJob(SequenceRequest, SearchJob):
         if not outcome.starved:
             return None
         if not outcome.rows:
-            return ObjectError(_unheld(self.inputs, outcome.results))
+            return StarvedError(_unheld(self.inputs, outcome.results))
         reached = ", ".join(f"{count:,} of {n}" for n, count in enumerate(self.report(outcome)["reached"], 1))
         asked = sum(part.rows for part in outcome.parts)
         return StarvedError(
