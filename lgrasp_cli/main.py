@@ -96,7 +96,7 @@ def main() -> None:
         code = _exit_code()
         sys.stdout.flush()
     except BaseException as error:
-        line, code = _explain(error)
+        line, code = explain(error)
         if line and os.environ.get("LGRASP_DEBUG", "0") not in ("", "0"):
             sys.excepthook(type(error), error, error.__traceback__)
         _leave(line, code)
@@ -120,7 +120,7 @@ def _refuse_empty(words: Sequence[str]) -> None:
             raise ConfigError(f"{name} '': empty; a name, a path or a number is accepted (is a variable not set?)")
 
 
-def _explain(error: BaseException) -> tuple[str, int]:
+def explain(error: BaseException) -> tuple[str, int]:
     """One line for the user and the exit code of a failure."""
     from lgrasp.errors import LgraspError
 

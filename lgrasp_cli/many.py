@@ -68,7 +68,7 @@ def show_plans(requests: "Sequence[Request]", how: How) -> None:
 
 def _run_one(request: "Request", how: How) -> dict[str, Any]:
     """The report of a job with its status, one line of why, and exit code."""
-    from lgrasp.errors import LgraspError
+    from lgrasp_cli.main import explain
 
     data: dict[str, Any] = {"title": request.title, "unit": request.unit}
     status, text, code = "done", "", 0
@@ -81,14 +81,14 @@ def _run_one(request: "Request", how: How) -> dict[str, Any]:
         found, outcome = run_job(job, how)
         data |= found
         conclude(outcome, how)
-    except LgraspError as error:
-        status, text, code = "starved" if error.exit_code == 3 else "failed", str(error), error.exit_code
-        typer.echo(f"error: {error}", err=True)
-    except (MemoryError, OSError) as error:
-        status, text, code = "failed", str(error), 2
-        typer.echo(f"error: {error or 'out of memory'}", err=True)
     except typer.Exit:
         status, code = "interrupted", 130
+    except Exception as error:  # also what nobody expects: the others do not end by it
+        line, code = explain(error)
+        if not line:  # nobody reads
+            raise
+        status, text = "starved" if code == 3 else "failed", line.removeprefix("error: ")
+        typer.echo(line, err=True)
     return data | {"status": status, "error": text, "exit_code": code}
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from lgrasp.hand.find import find_hand
 from lgrasp.object.find import find_object
+from lgrasp_cli.working import run_job
 
 
 @pytest.fixture
@@ -88,6 +89,19 @@ def test_sequences_are_in_folders_of_their_hands(cli, tmp_path):
     refused = cli("run", "two.yaml", "--dry-run")
     assert refused.code == 2
     assert "a/hand.urdf and b/hand.urdf have one folder" in refused.err.splitlines()[-1]
+
+
+def test_a_job_that_breaks_does_not_end_the_others(cli, quick, monkeypatch):
+    def broken(job, how):
+        if "tiny" in str(job.object):
+            raise ValueError("what nobody expects")
+        return run_job(job, how)
+
+    monkeypatch.setattr("lgrasp_cli.many.run_job", broken)
+    objects = ("--object", "tiny", "--object", "sphere")
+    made = cli("generate", *objects, "-p", quick, "-n", 4, "--device", "cpu", "--json", "-")
+    assert (made.code, [job["status"] for job in json.loads(made.out)["jobs"]]) == (1, ["failed", "done"])
+    assert "unexpected ValueError: what nobody expects" in made.err
 
 
 def test_what_holds_nothing(cli, tmp_path):
