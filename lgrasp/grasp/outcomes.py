@@ -117,8 +117,8 @@ def failed_bounds(table: GraspTable, outcome: np.ndarray, bounds: GraspBounds, l
         link_groups: group of each link, -1 of static ones, (L,): contacts of one group alone are too few.
     """
     touching, group = table.contact_links >= 0, link_groups[table.contact_links]
-    one = np.where(touching, group, -1).max(1, initial=-1) <= np.where(touching, group, len(link_groups)).min(1)
-    few = one | (touching.sum(1) < bounds.min_contacts)
+    most, least = np.where(touching, group, -1).max(1, initial=-1), np.where(touching, group, 99).min(1, initial=99)
+    few = (most <= least) | (touching.sum(1) < bounds.min_contacts)
     wide = table.metrics["gap"] > bounds.max_gap
     at = {name: code for code, name in enumerate(FAILED_BOUNDS)}
     # normals are bounded beside an edge as well, which normal_error does not tell
