@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from lgrasp.words import number
+from lgrasp_cli.explain import explain
 from lgrasp_cli.names import CONFIG, OBJECTS
 from lgrasp_cli.options import DryRun, given
 from lgrasp_cli.tables import TextTable, print_report
@@ -68,8 +69,6 @@ def show_plans(requests: "Sequence[Request]", how: How) -> None:
 
 def _run_one(request: "Request", how: How) -> dict[str, Any]:
     """The report of a job with its status, one line of why, and exit code."""
-    from lgrasp_cli.main import explain
-
     data: dict[str, Any] = {"title": request.title, "unit": request.unit}
     status, text, code = "done", "", 0
     try:

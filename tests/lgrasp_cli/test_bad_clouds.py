@@ -46,7 +46,7 @@ def changed(where, points=POINTS, normals=NORMALS, **more):
         ({"points": POINTS[:7], "normals": NORMALS[:7]}, "7 usable points; at least 50"),
         ({"points": SHELL, "normals": None}, "give its position as --viewpoint X,Y,Z"),
         ({"points": SHELL, "normals": np.zeros(SHELL.shape)}, "give its position as --viewpoint X,Y,Z"),
-        ({"normals": NORMALS[:5]}, "normals have shape (5, 3)"),
+        ({"normals": NORMALS[:5]}, "normals are an array of float64 of shape (5, 3)"),
         ({"points": 1e3 * POINTS}, "in millimetres use --scale 0.001"),
         ({"points": 1e2 * POINTS}, "in centimetres use --scale 0.01"),
         ({"points": 1e6 * POINTS}, "in micrometres use --scale 1e-06"),
@@ -74,7 +74,7 @@ def test_clouds(refused, tmp_path, arrays, words):
         (np.repeat([3, 0], [20, COUNT - 20]), ["--label", 3], "label 3 selects 20 points"),
         (np.repeat([3, 5], [500, COUNT - 500]), [], "give --label; its labels are 3 (500 points), 5"),
         (np.zeros(7, int), ["--label", 0], f"7 labels for a cloud of {COUNT:,} points"),
-        (np.full(COUNT, 0.5), ["--label", 0], "labels are float64, whole numbers or flags are accepted"),
+        (np.full(COUNT, 0.5), ["--label", 0], "label 0.5; whole numbers or flags are accepted"),
         (np.full(COUNT, "a"), ["--label", 0], "whole numbers or flags are accepted"),
     ],
 )

@@ -1,0 +1,45 @@
+"""A failure in one line for the user, with its exit code."""
+
+import re
+import sys
+
+import typer
+
+
+def explain(error: BaseException) -> tuple[str, int]:
+    """One line for the user and the exit code of a failure."""
+    from lgrasp.errors import LgraspError
+
+    if isinstance(error, LgraspError):
+        return f"error: {error}", error.exit_code
+    if type(error).__name__ == "NoArgsIsHelpError":  # no command: its message, the help, is printed already
+        return "", 2
+    if isinstance(error, typer.TyperException):
+        return f"error: {error.format_message()}{_extra_word(error)}", error.exit_code
+    if isinstance(error, KeyboardInterrupt | typer.Abort):
+        return "interrupted", 130
+    if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):  # nobody reads
+        return "", 141
+    if isinstance(error, SystemExit):
+        return "", error.code if isinstance(error.code, int) else 1
+    if isinstance(error, MemoryError) or "out of memory" in str(error).lower():
+        return "error: out of memory; lower --workers or --batch, or choose fewer --shard-rows", 2
+    if isinstance(error, OSError) and error.errno is not None:
+        where = f"{error.filename}: " if error.filename else ""
+        return f"error: {where}{error.strerror}", 2
+    return f"error: unexpected {type(error).__name__}: {error} (set LGRASP_DEBUG=1 for the traceback)", 1
+
+
+def _extra_word(error: typer.TyperException) -> str:
+    """How to give an option several values, for a word too many after one."""
+    found = re.search(r"unexpected extra argument\S* \((\S+)", error.format_message())
+    context, words = getattr(error, "ctx", None), sys.argv[1:]
+    if not found or not context or found[1].rstrip(")") not in words[2:]:
+        return ""
+    extra = found[1].rstrip(")")
+    option, value = words[words.index(extra) - 2 : words.index(extra)]
+    known = [each for each in context.command.params if option in each.opts]
+    if not known:
+        return ""
+    several = f": {option} {value} {option} {extra}" if getattr(known[0], "multiple", False) else ""
+    return f"; {option} takes one value{several and ', and may be repeated'}{several}"
