@@ -153,7 +153,8 @@ class RefineJob(RefineRequest, ShardJob):
         header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__, shard_index=index)
         # contacts are found anew, wherever they are
         objects = [replace(record, regions=None, touch_share=1.0) for record in shard.objects]
-        judged = tuple(name.removesuffix("holds") for name in shard.grasps.physics if name.endswith("_holds"))
+        verdicts = (name for name in shard.grasps.physics if name.endswith(("_holds", "_ok")))
+        judged = tuple(f"{name.rpartition('_')[0]}_" for name in verdicts)
         told = (*judged, *(f"seconds_{name[:-1]}" for name in judged))  # of rows as they were
         statistics = {name: value for name, value in shard.statistics.items() if not name.startswith(told)}
         refined = replace(shard, header=header, objects=objects, grasps=moved.rows, statistics=statistics)
