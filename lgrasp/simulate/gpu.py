@@ -191,7 +191,7 @@ class WorldTrials:
         enough = sum(sim.worlds >= len(waiting) for sim in self._pulled)
         smaller = self._pulled[max(enough - 1, 0) :][::-1]
         sim = smaller.pop()
-        steps = sim.steps(self._protocol.hold)
+        steps = self._model.steps(self._protocol.hold)
         total = math.ceil(steps / sim.chunk)  # all whole: worlds are at different ones
         job: np.ndarray = np.full((sim.worlds, 2), -1)  # grasp and direction of each world
         done, depth = np.zeros(sim.worlds, int), np.zeros(sim.worlds)

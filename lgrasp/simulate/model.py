@@ -69,6 +69,10 @@ class Model:
         """Targets of the drives at joint positions q (..., K)."""
         return np.where(self.columns >= 0, q[..., self.columns], 0.0)
 
+    def steps(self, seconds: float) -> int:
+        """How many steps some time takes, at least one."""
+        return max(1, round(seconds / self.mujoco.opt.timestep))
+
     def own(self) -> "Model":
         """The same with a copy of ``mujoco``, whose numbers may be changed."""
         return replace(self, mujoco=copy(self.mujoco))

@@ -41,12 +41,8 @@ class Trial:
         self._near, self._still = MujocoWorld(model, near=True), MujocoWorld(model)
         self._world: World = self._still if self._protocol.engine == "mujoco" else make_world(model)
         self._all = all_directions
-        self._timestep = model.mujoco.opt.timestep
-        self._chunk = self._steps(chunk_of(self._protocol))
+        self._chunk = model.steps(chunk_of(self._protocol))
         self._bounds = Bounds(model.protocol)
-
-    def _steps(self, seconds: float) -> int:
-        return max(1, round(seconds / self._timestep))
 
     def run(self, rows: GraspRows, i: int) -> Verdict:
         """Judge row ``i``; if its protocol has draws, in all of them."""
@@ -96,11 +92,11 @@ class Trial:
         """From the start to the squeeze, each target approached evenly; ends early when all is lost."""
         stops = [self._model.controls(targets[i].astype(float)) for targets in self._protocol.stops(rows)]
         contacts, worst, depth = 0, np.zeros((len(self._model.object_body), 2)), look.object_depth
-        ramp = steps = self._steps(self._protocol.phase)
+        ramp = steps = self._model.steps(self._protocol.phase)
         for a, b in pairwise(stops):
             if b is stops[-1]:  # the targets are q, the squeeze is next
                 contacts = self._touching_at_rest()
-                steps += round(self._protocol.rest / self._timestep)
+                steps += round(self._protocol.rest / self._model.mujoco.opt.timestep)
             for step in range(steps):
                 self._world.drive(a + (b - a) * min((step + 1) / ramp, 1.0))
                 self._world.step(1)
@@ -117,7 +113,7 @@ class Trial:
     def _touching_at_rest(self) -> int:
         """Fewest links on any object, at rest at the targets; the trial then continues from the previous state."""
         before = self._world.state()
-        self._world.step(self._steps(self._protocol.settle))
+        self._world.step(self._model.steps(self._protocol.settle))
         touching = self._world.links_touching()
         self._world.restore(before)
         return int(touching.min())
@@ -127,7 +123,7 @@ class Trial:
         diverged, holds, stays = False, True, True
         squeezed, shaken = self._world.state(), self._protocol.shake
         base = self._world.frames()[1][self._model.base_body].copy()
-        hold = np.ones((self._steps(self._protocol.hold), 1))
+        hold = np.ones((self._model.steps(self._protocol.hold), 1))
         course = shake_course(self._protocol) if shaken else {k: hold * axis for k, axis in enumerate(AXES)}
         for k, load in course.items():
             if not shaken:

@@ -205,7 +205,6 @@ class Worlds:
         self._lib: Any = mujoco_warp
         self._model, self._device, self.worlds = model, wp.get_device(device), worlds
         m, self._m, self._near = placed
-        self._timestep = m.opt.timestep
         with wp.ScopedDevice(self._device):
             per = {"nconmax": _CONTACTS_PER_OBJECT, "nccdmax": _DEEP_PER_OBJECT, "njmax": _CONSTRAINTS_PER_OBJECT}
             room = {name: number * len(model.object_body) for name, number in per.items()}
@@ -214,7 +213,7 @@ class Worlds:
             self._noslip = NoSlip(self._m, d, sweeps) if sweeps else None
             self._targets = t = _Targets()
             t.start, t.end, t.step = (wp.zeros((worlds, n), dtype=wp.float32) for n in (m.nu, m.nu, 1))
-            t.ramp = float(self.steps(model.protocol.phase))
+            t.ramp = float(model.steps(model.protocol.phase))
             self._rows = wp.empty(worlds, dtype=wp.int32)
             self._bodies = wp.array(model.object_body, dtype=wp.int32)
             self._forces = wp.empty((worlds, len(model.object_body), 3), dtype=wp.float32)
@@ -228,7 +227,7 @@ class Worlds:
             force = d.xfrc_applied
             self._applied = wp.array(ptr=force.ptr, dtype=wp.float32, shape=(worlds, 6 * m.nbody), copy=False)
         self.state: Kept = (d.qpos, d.qvel, d.qacc_warmstart, self._applied, t.start, t.end, t.step)
-        self.chunk = self.steps(CHUNK)
+        self.chunk = model.steps(CHUNK)
         self._graph: Any = None
         self._full = sum(int(mujoco_warp.OverflowType[name]) for name in _BUFFER_WARNINGS)
         self._compile()
@@ -247,12 +246,8 @@ class Worlds:
 
     def chunks(self, seconds: float) -> Iterator[int]:
         """Steps of all chunks of some time, the last of which may be shorter."""
-        steps = self.steps(seconds)
+        steps = self._model.steps(seconds)
         return (min(self.chunk, steps - done) for done in range(0, steps, self.chunk))
-
-    def steps(self, seconds: float) -> int:
-        """How many steps some time takes."""
-        return max(1, round(seconds / self._timestep))
 
     def advance(self, steps: int) -> None:
         """Step every world."""

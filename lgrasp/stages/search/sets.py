@@ -5,13 +5,13 @@ import warp as wp
 from lgrasp.grasp.structs import Candidates
 from lgrasp.math.constants import INSCRIBED
 from lgrasp.math.frictionless import centroid, frictionless
-from lgrasp.math.limits import MAX_CONTACTS, MAX_GROUPS
+from lgrasp.math.limits import MAX_CONTACTS, MAX_GROUPS, MAX_KINDS
 from lgrasp.math.qp import NO_LIMIT, balance
 from lgrasp.math.transforms import vec3s
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import params_struct
-from lgrasp.stages.search.params import MAX_KINDS, MAX_RESTARTS, SearchParams
+from lgrasp.stages.search.params import MAX_RESTARTS, SearchParams
 
 wp.set_module_options(KERNEL_OPTIONS)
 

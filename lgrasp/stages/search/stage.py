@@ -12,7 +12,7 @@ from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.structs import State
 from lgrasp.grasp.tables import CandidateTable, ContactSets
 from lgrasp.math.constants import LOAD_DIRECTIONS
-from lgrasp.math.limits import MAX_GROUPS
+from lgrasp.math.limits import MAX_GROUPS, MAX_KINDS
 from lgrasp.runtime.scan import running_sums
 from lgrasp.runtime.structs import empty_struct, make_struct
 from lgrasp.runtime.tally import Tally, empty_tally
@@ -40,7 +40,7 @@ from lgrasp.stages.search.kernels import (
     take_sets,
 )
 from lgrasp.stages.search.mutate_kernels import mutate_contacts
-from lgrasp.stages.search.params import MAX_KINDS, SearchParams
+from lgrasp.stages.search.params import SearchParams
 from lgrasp.stages.search.sets import AskedCandidates, FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
 from lgrasp.stages.search.swap_kernels import swap_contacts
 
