@@ -11,7 +11,7 @@ from lgrasp.geometry.clusters import CLUSTER_SIZE, bounding_spheres, cluster_ord
 from lgrasp.geometry.decompose import Decompose
 from lgrasp.hand.contacts import body_cones, link_points
 from lgrasp.hand.digest import urdf_digest
-from lgrasp.hand.geometry import convex_pieces, geometry_mesh, inner_spheres, surface_samples
+from lgrasp.hand.geometry import convex_pieces, geometry_mesh, inner_spheres, one_solid, surface_samples
 from lgrasp.hand.model import HandModel, csr, piece_arrays, stack_rows
 from lgrasp.hand.overlap import overlap_arrays
 from lgrasp.hand.pairs import with_pairs
@@ -96,7 +96,7 @@ class _Solids:
                 if note:
                     self.notes.append(f"link '{link}': {note}")
                     self.dented.add(link)
-                mesh.apply_transform(T)
+                mesh = one_solid(mesh).apply_transform(T)
                 self.meshes.setdefault(link, []).append(mesh)
                 for piece in pieces:
                     moved = piece.moved(T)

@@ -16,6 +16,7 @@ from lgrasp.geometry.edges import sample_creases
 from lgrasp.geometry.hulls import convex_hull, farthest_corners, fewer_corners
 from lgrasp.geometry.mesh_files import check_whole
 from lgrasp.geometry.obj_file import read_obj
+from lgrasp.geometry.union import outer_mesh
 from lgrasp.geometry.winding import outward
 from lgrasp.hand.distance import signed_distance
 from lgrasp.hand.piece import Piece
@@ -26,6 +27,7 @@ _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by hal
 _CYLINDER_SIDES = 32
 _SMALLEST = 5.0e-4  # [m] largest side of a mesh
 _MAX_BODIES = 16  # of one mesh
+_MOST_APART = 0.999  # bodies of one mesh lie apart if their union has more than this of their volumes
 _SHARP_CELL, _MOST_SHARP = 0.002, 96
 _CREASE_ANGLE = 45.0  # [deg]
 _MIN_HULL_SHARE = 0.9  # a body that fills less of its hull ...
@@ -98,7 +100,16 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
 def link_meshes(urdf: Urdf, tree: Tree, link: str) -> list[trimesh.Trimesh]:
     """Triangle meshes of the collision elements of a link, body frame [m]."""
     T = tree.T_body_link[tree.link_names.index(link)]
-    return [geometry_mesh(urdf, g).apply_transform(T @ g.T_link_geometry) for g in urdf.links[link]]
+    return [one_solid(geometry_mesh(urdf, g)).apply_transform(T @ g.T_link_geometry) for g in urdf.links[link]]
+
+
+def one_solid(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A mesh, without the walls that closed bodies of it have inside one another: no wall there is near an outside."""
+    if not 1 < mesh.body_count <= _MAX_BODIES:
+        return mesh
+    bodies = list(mesh.split(only_watertight=False))
+    outer = outer_mesh(bodies)
+    return outer if outer.is_volume and outer.volume < _MOST_APART * sum(body.volume for body in bodies) else mesh
 
 
 def thin_mesh(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
+from lgrasp.geometry.union import outer_mesh
 from lgrasp.hand.contacts import cover_patches, grid_arrays, link_grid
 from lgrasp.hand.model import csr, stack_rows
 from lgrasp.hand.tree import Tree
@@ -136,19 +137,3 @@ def with_bare_links(arrays: Mapping[str, np.ndarray], others: Mapping[str, np.nd
             out[name] = np.concatenate([out[name], part])
             out[first] = np.append(out[first], out[first][-1] + len(part)).astype(np.int32)
     return out
-
-
-def joined_mesh(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Several meshes as one."""
-    whole = trimesh.util.concatenate(meshes)
-    assert isinstance(whole, trimesh.Trimesh)
-    return whole
-
-
-def outer_mesh(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """The surface of the union of solids, without what one covers of another; all of it where they are no solids."""
-    if len(meshes) > 1 and all(mesh.is_volume for mesh in meshes):
-        whole = trimesh.boolean.union(meshes, engine="manifold")
-        if whole.is_volume:
-            return whole
-    return joined_mesh(meshes)

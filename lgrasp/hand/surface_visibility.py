@@ -6,12 +6,13 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from lgrasp.geometry.union import joined_mesh
 from lgrasp.hand.contact_surface import ContactSurface
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.geometry import link_meshes
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.postures import Postures, sample_bodies
-from lgrasp.hand.surface import SurfaceSamples, joined_mesh
+from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.urdf import Urdf, read_urdf
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.fetch import to_numpy

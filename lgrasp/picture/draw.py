@@ -8,7 +8,7 @@ import trimesh
 import warp as wp
 
 from lgrasp.geometry.poses import device_from_stored
-from lgrasp.hand.surface import joined_mesh
+from lgrasp.geometry.union import joined_mesh
 from lgrasp.picture import shade_kernels as kernels
 from lgrasp.picture.camera import Intrinsics, central_camera, look_at
 from lgrasp.picture.depth import LabelledMesh, join_surfaces, render

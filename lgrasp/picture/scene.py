@@ -10,11 +10,11 @@ import trimesh
 
 from lgrasp.errors import ShardError
 from lgrasp.geometry.poses import pose_matrix
+from lgrasp.geometry.union import joined_mesh
 from lgrasp.grasp.hand_files import checked_urdf
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 from lgrasp.hand.geometry import geometry_mesh, thin_mesh
 from lgrasp.hand.links import link_poses
-from lgrasp.hand.surface import joined_mesh
 from lgrasp.hand.urdf import Urdf
 
 _SHARP = 0.8  # least cosine between a face and its corner's mean normal; edges of less are sharp

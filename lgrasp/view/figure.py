@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 
 from lgrasp.geometry.poses import pose_from_matrix
+from lgrasp.geometry.union import joined_mesh
 from lgrasp.grasp.records import ObjectRecord
-from lgrasp.hand.surface import joined_mesh
 from lgrasp.picture.draw import CONTACT, HAND, OBJECTS, TABLE, rgb
 from lgrasp.picture.scene import STAGES, GraspScene, HandShape, balls, split_edges, table_piece
 

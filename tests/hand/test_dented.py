@@ -13,12 +13,12 @@ from support.solids import ELL, YOU, prism
 from lgrasp.errors import DecomposeError
 from lgrasp.field.kernels import sample_postures
 from lgrasp.geometry.decompose import decompose
+from lgrasp.geometry.union import joined_mesh
 from lgrasp.hand.arrays import Hand, body_poses, upload_hand
 from lgrasp.hand.build import build_hand
 from lgrasp.hand.geometry import convex_pieces, is_dented
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.self_collision import OVERLAP, overlap_depth
-from lgrasp.hand.surface import joined_mesh
 from lgrasp.hand.urdf import Geometry, Urdf, read_urdf
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 

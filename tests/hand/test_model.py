@@ -6,19 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy.interpolate import interpn
 from support.convex import hull_distance
 from support.hands import HANDS, hand_model, hand_source, minimal_spec
 from support.urdfs import fingers
 
 from lgrasp.errors import HandError
+from lgrasp.geometry.union import joined_mesh, outer_mesh
 from lgrasp.hand.build import build_hand
-from lgrasp.hand.contacts import link_points
-from lgrasp.hand.geometry import convex_piece, geometry_mesh, inner_spheres, link_meshes
+from lgrasp.hand.contacts import link_grid, link_points
+from lgrasp.hand.geometry import convex_piece, geometry_mesh, inner_spheres, link_meshes, one_solid
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.pairs import pieces_touch
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.spec import Coupling
-from lgrasp.hand.surface import joined_mesh, outer_mesh
 from lgrasp.hand.tree import Tree, build_tree
 from lgrasp.hand.urdf import Geometry, Joint, read_urdf
 
@@ -337,6 +338,21 @@ def test_recessed_surface_is_no_contact():
     assert (points[up, 2] > 0.0074).mean() > 0.5
     assert not (up & (np.abs(points[:, 0]) < 0.005)).any()
     assert (normals[:, 2] < -0.99).sum() > 50
+
+
+def test_walls_of_one_body_inside_another_are_no_outside():
+    """A mesh file of two boxes through each other: depth is that to the outside, and no wall within is a contact."""
+    boxes = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation((x, 0, 0)) for x in (0.0, 0.009)]
+    apart = joined_mesh([boxes[0], boxes[1].copy().apply_translation((0.05, 0, 0))])
+    assert one_solid(apart) is apart
+    whole = one_solid(joined_mesh(boxes))
+    assert whole.volume == pytest.approx(0.029 * 0.02**2)
+    grid = link_grid([whole], "cpu")
+    middle = np.array([[0.0045, 0, 0], [-0.001, 0, 0.003], [0.0105, 0, 0]])  # [m], near walls at x = -1 and 10 mm
+    places = [grid.origin[a] + grid.cell * np.arange(grid.values.shape[a]) for a in range(3)]
+    np.testing.assert_allclose(interpn(places, grid.values, middle), [-0.01, -0.007, -0.0085], atol=2e-4)
+    points, _ = link_points([whole], np.eye(4), (), np.random.default_rng(0))
+    assert (np.abs(points[np.abs(points[:, 0] - 0.0045) < 0.0135]).max(1) > 0.0099).all()
 
 
 def test_what_one_solid_covers_of_another_is_no_surface():

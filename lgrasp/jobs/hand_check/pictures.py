@@ -9,12 +9,13 @@ from scipy.spatial import cKDTree
 
 from lgrasp.engine.inputs import Inputs
 from lgrasp.files import write_file
+from lgrasp.geometry.union import joined_mesh
 from lgrasp.hand.fingers import finger_label
 from lgrasp.hand.geometry import thin_mesh
 from lgrasp.hand.model import HandModel
 from lgrasp.hand.opposition.spaces import space_sides
 from lgrasp.hand.postures import sample_bodies
-from lgrasp.hand.surface import SurfaceSamples, joined_mesh
+from lgrasp.hand.surface import SurfaceSamples
 from lgrasp.hand.surface_visibility import last_bodies, link_surfaces, visible_surface
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.hand_check.diagnose import field_vectors
