@@ -19,8 +19,10 @@ from lgrasp.simulate.worlds import Kept, Placed, Sighting, Worlds
 
 _SHARES = (4.0, 2.0, 1.0, 0.5, 0.25, 0.0625)
 """Worlds in which closed hands are pulled, over those in which they close: fewer and fewer, as directions end."""
-_FEW_PER_THREAD = 4
-"""Directions for each thread of the CPU, which ends the last: a GPU steps a few worlds no faster than thousands."""
+_MOST_THREADS = 16
+"""Of the CPU, which ends the last directions: more wait for each other, as Python runs between their steps."""
+_FEW, _FEW_PER_THREAD = 64, 8
+"""Directions that are the last: a GPU steps so few worlds no faster than thousands. No more for each thread."""
 _WORLD_BYTES = 3.0e5
 """Of a GPU's memory, that a world takes for each object."""
 _MOST_HANDS, _LEAST_HANDS = 8192, 256
@@ -61,7 +63,7 @@ class WorldTrials:
     Args:
         device: Warp device.
         worlds: hands closed at a time.
-        threads: of the CPU, which ends the last directions.
+        threads: of the CPU, which ends the last directions, 16 at most.
         all_directions: as of :class:`Trial`.
     """
 
@@ -73,7 +75,8 @@ class WorldTrials:
         self._sim = Worlds(model, placed, worlds, device)
         self._pulled = [Worlds(model, placed, max(1, int(worlds * share)), device) for share in _SHARES]
         self._every = all_directions
-        self._spare = [Trial(model, all_directions=all_directions) for _ in range(threads)]
+        self._few = min(_FEW, _FEW_PER_THREAD * threads)
+        self._spare = [Trial(model, all_directions=all_directions) for _ in range(min(threads, _MOST_THREADS))]
         self._bounds, self._one = Bounds(model.protocol), threading.Lock()
         at, turn = (a[0, model.base_body].astype(float) for a in self._sim.frames())
         T = np.block([[turn, at[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
@@ -219,7 +222,7 @@ class WorldTrials:
                 for values, none in zip(pulls, Pulls.of(n, objects), strict=True):
                     values[late] = none[late]
                 return pulls, np.asarray((wild_pulls & ~late).any(1))
-            if not len(waiting) and len(busy) <= _FEW_PER_THREAD * len(self._spare):
+            if not len(waiting) and len(busy) <= self._few:
                 so_far = [Closed(0, np.nan, False, worst[w], depth[w]) for w in busy]
                 i, k = job[busy].T
                 wild_pulls[i, k] = self._end_here(
