@@ -96,8 +96,8 @@ def bench_methods(
 def measure_sequence(job: SequenceJob, device: str) -> dict[str, Any]:
     """Run a round of a job, simulate every row and continue those that hold; nothing is written.
 
-    Grasps of an optimiser, and of a network as they are drawn, are simulated as published: only a penetration of 1 cm,
-    contacts farther away than that, and links in links are left out before.
+    Grasps of an optimiser, and of a network as they are drawn, are simulated unless they penetrate by 1 cm (hand or
+    objects), as published, a contact is farther off than 5 cm, or links are in links.
 
     Returns:
         ``begun`` (attempts), ``device``, ``spaces`` (name -> sequences tried with it, rows found, rows that held) and
@@ -223,12 +223,19 @@ def read_parts(path: Path) -> dict[str, Any]:
 
 
 def _as_published(pipeline: Pipeline) -> Pipeline:
-    """The pipeline; for an optimiser, or draws that are not refined, with the published bounds in place of its own."""
+    """The pipeline; for an optimiser, or draws that are not refined, with bounds as wide as the published ones."""
     params = pipeline.params("sequence")
     if params.method == "field" or (params.method == "diffuser" and params.refined):
         return pipeline
     return pipeline.with_bounds(
-        max_penetration=0.01, min_self_distance=0.0, max_gap=0.01, max_normal_angle=60.0, max_gswo=1.0
+        max_penetration=0.01,
+        min_object_distance=-0.01,
+        min_self_distance=0.0,
+        max_gap=0.05,
+        max_normal_angle=180.0,
+        max_normal_spread=180.0,
+        max_gswo=10.0,
+        max_unresisted_load=1.0,
     )
 
 
@@ -257,7 +264,7 @@ def sequence_page(result: dict[str, Any]) -> Page:
         tables += _object_tables(found["objects"], published | published.get(method.split()[0], {}))
     tables.append(_rate_table(result))
     notes = [
-        "hold/tried, hold/begun: of all attempts, as published; the other shares are of what was left of them",
+        "hold/tried, hold/begun: of all attempts begun; the other shares are of what was left of them",
         "drawn: candidates for each attempt at this step; pass: of these, through the filter",
         "(...): published; strict: rows within the bounds of the pipeline, whether they hold or not",
         *caveats(result["published"]),

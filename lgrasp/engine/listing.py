@@ -29,6 +29,26 @@ from lgrasp.files import remove_leftovers, writing
 _MOST_LISTING = 0.05  # share of a job's time that manifests may take while it runs
 
 
+class _Seldom:
+    """When manifests may be written while a job runs, so that it takes little of its time."""
+
+    def __init__(self) -> None:
+        self._ended, self._took = 0.0, 0.0  # [s]
+
+    @property
+    def again(self) -> bool:
+        """Whether it is time to."""
+        return time.monotonic() - self._ended > self._took / _MOST_LISTING
+
+    @contextmanager
+    def noted(self) -> Iterator[None]:
+        """Around the writing."""
+        begin = time.monotonic()
+        yield
+        self._ended = time.monotonic()
+        self._took = self._ended - begin
+
+
 class Listing:
     """The entries of a job in the manifests of its folders.
 
@@ -48,8 +68,7 @@ class Listing:
         self._unlisted: dict[Path, dict[str, tuple[ListedShard, int]]] = defaultdict(dict)  # with the file's time [ns]
         self._lock = threading.Lock()
         self._mark = ExitStack()
-        self._flushed = 0.0  # when, and how long it took [s]
-        self._took = 0.0
+        self._seldom = _Seldom()
 
     @contextmanager
     def kept(self, present: Mapping[int, int]) -> "Iterator[Listing]":
@@ -115,7 +134,7 @@ class Listing:
         with self._lock:
             self._made[part.file.parent][shard.file] = shard
             self._unlisted[part.file.parent][shard.file] = shard, time_ns
-        if time.monotonic() - self._flushed > self._took / _MOST_LISTING:
+        if self._seldom.again:
             self.flush()
 
     def remove(self, files: Sequence[Path]) -> None:
@@ -127,14 +146,11 @@ class Listing:
 
     def flush(self) -> None:
         """Write what is not yet in the manifests; what is there another process may have made since."""
-        with self._lock:
-            begin = time.monotonic()
+        with self._lock, self._seldom.noted():
             for folder, unlisted in self._unlisted.items():
                 if unlisted:
                     update_manifest(folder, partial(_record, self.run, folder, list(unlisted.values())))
                     unlisted.clear()
-            self._flushed = time.monotonic()
-            self._took = self._flushed - begin
 
     def close(self) -> None:
         """Say that this process is done; remove manifests without any file, and folders that were made for nothing."""
@@ -203,11 +219,13 @@ class Renewing:
     def __init__(self, parts: Sequence[Part]) -> None:
         self._parts, self._lock = parts, threading.Lock()
         self._changing: set[Path] = set()
+        self._changed: list[Path] = []
+        self._seldom = _Seldom()
 
     @contextmanager
     def kept(self, present: Mapping[int, int]) -> "Iterator[Renewing]":
         """Keep the manifests while files are replaced: one that is going to be is listed without size and SHA-256 until
-        it is, so that a process may be killed at any moment.
+        some time after it is, so that a process may be killed at any moment.
 
         Args:
             present: rows of the parts that are made already, by number.
@@ -222,6 +240,7 @@ class Renewing:
             _renew([part.file for part in self._parts if part.file not in self._changing])
             _renew(self._changing, changing=True)
             yield self
+            self.flush()
         finally:
             self.close()
 
@@ -229,13 +248,22 @@ class Renewing:
         """List a file as it is now."""
         with self._lock:
             self._changing.discard(part.file)
-        _renew([part.file], changed=True)
+            self._changed.append(part.file)
+        if self._seldom.again:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is not yet in the manifests."""
+        with self._lock, self._seldom.noted():
+            _renew(self._changed, changed=True)
+            self._changed = []
 
     def close(self) -> None:
-        """List files that were not replaced after all."""
-        with self._lock:
-            left, self._changing = self._changing, set()
+        """List all files as they are, those that were not replaced after all, too."""
         with suppress(OutputError):
+            self.flush()
+            with self._lock:
+                left, self._changing = self._changing, set()
             _renew(left)
 
 

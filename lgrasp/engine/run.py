@@ -255,6 +255,8 @@ def run(
                 _make_parts(job, events, outcome, job._manifests, replaces=[] if resume else every)
         except CancelledError:
             outcome.cancelled = True
+        finally:
+            job._manifests = None  # they know each other, and Python looks for circles seldom
     outcome.seconds["parts"] = time.perf_counter() - begin
     outcome.seconds["total"] = time.perf_counter() - start
     return outcome

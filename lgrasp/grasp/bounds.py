@@ -44,10 +44,10 @@ class GraspBounds(Params):
 
     profile: str = Field(default="strict", description="Where numbers that are not given come from: strict or plan.")
     max_gap: float = Field(
-        default=0.0013, gt=0, le=0.02, description="Largest distance of link and object at a contact."
+        default=0.0013, gt=0, le=0.05, description="Largest distance of link and object at a contact."
     )
     max_normal_angle: float = Field(
-        default=17.0, gt=0, le=90, description="Largest angle of the normals of link and object at a contact [deg]."
+        default=17.0, gt=0, le=180, description="Largest angle of the normals of link and object at a contact [deg]."
     )
     max_normal_spread: float = Field(
         default=20.0, gt=0, le=180, description="Largest angle of the object's normals about a contact [deg]."
@@ -60,7 +60,10 @@ class GraspBounds(Params):
         default=0.0003, ge=0, le=0.01, description="Least distance of links that do not touch."
     )
     min_object_distance: float = Field(
-        default=0.0005, ge=0, le=0.05, description="Least distance of the object from objects held."
+        default=0.0005,
+        ge=-0.01,
+        le=0.05,
+        description="Least distance of the object from objects held; below 0 they may overlap.",
     )
     min_contacts: int = Field(default=2, ge=2, le=7, description="Fewest contacts, each on a link of its own.")
     friction: float = Field(default=0.5, gt=0, le=2, description="Friction coefficient of every measure.")

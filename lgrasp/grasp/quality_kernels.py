@@ -104,7 +104,7 @@ def resist_loads(obj: Object, limits: Limits, places: Places, at: CheckedPosture
     turn = wp.quat_inverse(wp.transform_get_rotation(at.pose[at.of[i]]))
     # not until it is below the worst so far: the answer would depend on which direction came first
     load = unresisted(points, normals, k, limits.friction, turn, direction, 0.0, most)
-    wp.atomic_max(found_out.unresisted_load, i, load)
+    wp.atomic_max(found_out.unresisted_load, i, wp.min(load, 1.0))  # rounding may give more
 
 
 @wp.kernel

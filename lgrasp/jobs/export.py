@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from lgrasp.dataset.conditions import parse_condition
 from lgrasp.dataset.exports.folder import INDEX
 from lgrasp.dataset.exports.formats import FORMATS, export_shards
+from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.dataset.exports.selection import chosen_rows, number_columns, verdict_columns
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.manifest import tell_differences
@@ -21,7 +21,7 @@ from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.run import Job
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import OutputError
-from lgrasp.grasp.records import ObjectRecord
+from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import TABLE_FIELDS
 from lgrasp.jobs.requests.shards import ExportRequest
 
@@ -45,7 +45,7 @@ class ExportJob(ExportRequest, Job):
         rows = [shard.value for shard in gather(self.shards, digest)]
         options = {"limit": self.limit, "where": list(self.where), "licence": self.licence}
         parts = Split.read(self.split).model_dump(mode="json") if self.split else None
-        return content_key("export", 4, to=self.to, rows=rows, split=parts, **options)
+        return content_key("export", 5, to=self.to, rows=rows, split=parts, **options)
 
     def parts(self) -> list[Part]:
         tell_differences(self.shards)
@@ -65,7 +65,7 @@ class ExportJob(ExportRequest, Job):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         how: dict[str, Any] = {name: getattr(self, name) for name in ("where", "limit", "split", "licence")}
-        how |= {"run_key": self.key(), "cut": partial(self._cut, progress) if self.to == "mjcf" else None}
+        how |= {"run_key": self.key(), "cut": self._cut(progress) if self.to == "mjcf" else None}
 
         def advance(done: int, total: int) -> None:
             replace(progress, part=replace(part, rows=total))(done)
@@ -82,12 +82,24 @@ class ExportJob(ExportRequest, Job):
         objects = [code for path in outcome.paths for code in json.loads(path.read_bytes())["objects"]]
         return {"grasps": outcome.rows, "objects": objects, "format": self.to}
 
-    def _cut(self, progress: PartProgress, record: ObjectRecord) -> Sequence[np.ndarray]:
-        """Convex pieces of an object as the simulation makes them, from the cache; approximations are reported."""
+    def _cut(self, progress: PartProgress) -> Cut:
+        """Convex pieces as the simulation makes them, from the cache; approximations of objects are reported."""
         from lgrasp.jobs.records import cutter
+        from lgrasp.simulate.assemble import inflated
+        from lgrasp.simulate.scene import hand_of_record
         from lgrasp.simulate.solid import object_of_record
 
-        solid = object_of_record(record, cutter(self.cache, self.events, progress))
-        for note in solid.notes:
-            self.cache.warn(f"object '{record.name}': {note}")
-        return solid.pieces
+        decompose = cutter(self.cache, self.events, progress)
+
+        def of_object(record: ObjectRecord) -> Sequence[np.ndarray]:
+            solid = object_of_record(record, decompose)
+            for note in solid.notes:
+                self.cache.warn(f"object '{record.name}': {note}")
+            return solid.pieces
+
+        def of_hand(record: HandRecord) -> dict[str, list[np.ndarray]]:
+            hand = hand_of_record(record, decompose)
+            cut = sorted(link for link in hand.cut if all(len(piece.planes) for piece in hand.pieces[link]))
+            return {link: [inflated(piece) for piece in hand.pieces[link]] for link in cut}
+
+        return Cut(of_object, of_hand)

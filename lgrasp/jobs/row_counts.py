@@ -16,7 +16,7 @@ from lgrasp.grasp.records import GraspRows
 from lgrasp.runtime.tally import add_counts
 
 PUBLISHED_FSWO = 0.15
-"""Squared frictionless residual below which the published system counts a grasp."""
+"""Squared frictionless residual below which the program of Lightning Grasp counts a grasp (its paper tells none)."""
 
 _THREADS = 4
 _Column = Callable[[str], np.ndarray]

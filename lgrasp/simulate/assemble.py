@@ -117,7 +117,7 @@ def assemble(
 
 def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> None:
     if len(piece.planes):
-        add_hull(mujoco, spec, body, _inflated(piece), name)
+        add_hull(mujoco, spec, body, inflated(piece), name)
     elif len(piece.vertices) == 1:
         size = [piece.radius, 0, 0]
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=piece.vertices[0])
@@ -126,7 +126,7 @@ def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> No
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[piece.radius, 0, 0], fromto=ends)
 
 
-def _inflated(piece: Piece) -> np.ndarray:
+def inflated(piece: Piece) -> np.ndarray:
     """Vertices (V, 3) of a hull grown by the piece's radius, a fraction of a millimetre."""
     if piece.radius == 0.0:
         return piece.vertices

@@ -22,6 +22,8 @@ class HandSolids:
     """Of its URDF."""
     pieces: dict[str, list[Piece]]
     """Convex pieces of each link, link frame [m]."""
+    cut: frozenset[str]
+    """Links that have more pieces than collision elements, as these are no convex solids."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,4 +60,5 @@ def hand_of_record(record: HandRecord, decompose: Decompose, device: str = "cpu"
     """
     with checked_urdf(record) as urdf:
         pieces = {link: link_pieces(urdf, link, decompose, device)[0] for link in urdf.links}
-    return HandSolids(record, urdf.joints, pieces)
+        cut = frozenset(link for link, elements in urdf.links.items() if len(pieces[link]) > len(elements))
+    return HandSolids(record, urdf.joints, pieces, cut)

@@ -1,22 +1,26 @@
 """``manifest.json`` of a run: what was asked and what is there, whatever happened on the way."""
 
+import gc
 import hashlib
 import json
 import os
 import shutil
 import threading
+import time
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from support.jobs import SampleJob, StopAfter
 from support.shards import sample_shard
 
-from lgrasp.dataset.manifest import compare, read_manifest, workers
+from lgrasp.dataset.manifest import compare, read_manifest, update_manifest, workers
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.writer import write_shard
+from lgrasp.engine import listing
 from lgrasp.engine.events import CancelledError, Events
 from lgrasp.engine.listing import Renewing
 from lgrasp.engine.run import run
@@ -277,6 +281,44 @@ def test_two_processes_that_renew_a_file(tmp_path):
             process.record(part, 2, written=True)
     (shard,) = document(tmp_path)["runs"][0]["shards"]
     assert shard["sha256"] == hashlib.sha256(part.file.read_bytes()).hexdigest()
+
+
+def test_many_files_are_renewed_in_few_manifests(tmp_path, monkeypatch):
+    """Manifests grow with the files: writing one for each took most of the time of thousands."""
+    run(SampleJob(out=tmp_path, rows=40))
+    parts = SampleJob(out=tmp_path, rows=40).parts()
+    before = (tmp_path / "manifest.json").read_bytes()
+    written = []
+
+    def slow(folder, change):
+        written.append(folder)
+        time.sleep(0.02)
+        update_manifest(folder, change)
+
+    monkeypatch.setattr(listing, "update_manifest", slow)
+    with Renewing(parts).kept({}) as renewing:
+        for part in parts:
+            renewing.record(part, 2, written=True)
+    assert len(written) < 6
+    assert (tmp_path / "manifest.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_a_finished_job_is_gone_at_once(tmp_path, in_place):
+    """What it holds of objects, tens of MB, does not wait until Python looks for circles."""
+
+    class Replacing(SampleJob):
+        in_place: ClassVar[bool] = True
+
+    job = (Replacing if in_place else SampleJob)(out=tmp_path, rows=4)
+    gc.disable()
+    try:
+        run(job, resume=False)
+        seen = weakref.ref(job)
+        del job
+        assert seen() is None
+    finally:
+        gc.enable()
 
 
 def test_a_working_process_is_seen(tmp_path):

@@ -102,8 +102,9 @@ class HandFrames:
             if j.mimic is not None and name not in self.joint_names
         }
         """Joints that are not in q: source joint, multiplier, offset."""
-        moving = self._between()
-        self._columns = [i for i, name in enumerate(self.joint_names) if name in moving]
+        self.held = frozenset(self._between())
+        """Joints that decide where the base link is; none moves in a grasp."""
+        self._columns = [i for i, name in enumerate(self.joint_names) if name in self.held]
 
     def base_from_root(self, q: np.ndarray) -> np.ndarray:
         """``T_base_root``: poses [n, 7] of the URDF's root link in the base link's frame; q is [n, K].

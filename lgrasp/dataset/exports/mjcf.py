@@ -1,9 +1,10 @@
 """MJCF: one MuJoCo scene per grasp, with keyframes before closing, at the grasp and squeezing."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, lru_cache
+from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from lxml import etree
@@ -17,7 +18,7 @@ from lgrasp.dataset.files import parsing
 from lgrasp.errors import PhysicsError, ShardError, short_reason
 from lgrasp.files import write_file
 from lgrasp.geometry.poses import inverse
-from lgrasp.grasp.records import ObjectRecord
+from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.object.mass import MassProperties, mass_properties
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.builder import add_drive, set_compiler, set_contact, set_joint, set_mass, set_options
@@ -26,11 +27,18 @@ from lgrasp.simulate.protocol import PROTOCOLS
 if TYPE_CHECKING:
     import mujoco
 
-Cut = Callable[[ObjectRecord], Sequence[np.ndarray]]
-"""Convex pieces of an object, vertices [m] of each, shape [V, 3]."""
+
+class Cut(NamedTuple):
+    """Convex pieces, vertices [m] of each, shape [V, 3]."""
+
+    object: Callable[[ObjectRecord], Sequence[np.ndarray]]
+    hand: Callable[[HandRecord], Mapping[str, Sequence[np.ndarray]]]
+    """Of the links whose collision meshes are no convex solids, link frames."""
+
 
 _PROTOCOL = PROTOCOLS["fc"]  # the scenes are as this one simulates
 _MAX_LINK_OVERLAP = 0.001  # links of the hand that overlap more at the grasp do so because hulls stand for meshes [m]
+_HELD_STIFFER = 1000.0  # joints above the base link, which protocol fc welds
 _KEYS = ("grasp", "pregrasp", "squeeze")
 
 MJCF_NOTES = """\
@@ -41,16 +49,19 @@ grasps/NUMBER.xml  MuJoCo scene of one grasp: mujoco.MjModel.from_xml_path(FILE)
   keyframe pregrasp  the hand before closing
   keyframe squeeze   the hand at the grasp, its actuators pressing on the object
   actuators          one position servo per joint of the list below, named as it is: 5 N m/rad (500 N/m for sliding
-                     joints), critically damped. Joints that follow others are tied by equality constraints.
+                     joints), a thousand times that of joints between {root} and {base}, which do not give way;
+                     critically damped. Joints that follow others are tied by equality constraints.
   bodies             the links of hand.urdf under their names; object_PLACE_CODE, free, 0.1 kg. PLACE counts the objects
                      in the hand from 0, in the order in which they were taken; all are where they are at the grasp of
                      the last one, which keyframe pregrasp is before.
 
 The world's frame is that of link {root}, the root link of hand/hand.urdf, which is fixed. No gravity; friction 0.6,
-none between links of the hand; all numbers are those of protocol fc of lgrasp simulate.
+none between links of the hand; all numbers are those of protocol fc of lgrasp simulate. If gravity is turned on, it
+pulls the objects alone (gravcomp of the links). Grasps need the scene's cone and impratio: with MuJoCo's own most
+objects creep out of the hand.
 An object collides with the convex pieces objects/CODE/piece_NN.obj; where there are none, with the hull of its mesh,
-which fills its hollows. A mesh of the hand collides with its hull; links whose hulls overlap at the grasp are kept from
-colliding with each other.
+which fills its hollows. Meshes of the hand collide with their hulls, links that these would fill with the pieces
+hand/pieces/piece_NN.obj; links that overlap at the grasp are kept from colliding with each other.
 """
 
 
@@ -84,21 +95,33 @@ class MjcfScene:
 
     Args:
         hand: ``hand/hand.urdf`` and the meshes it names, by their path in the export.
+        pieces: Files of the convex pieces of links that collide with them in place of their own meshes.
         objects: The objects, in the order of the row.
 
     Raises:
         PhysicsError: MuJoCo is not installed, or refuses the hand or a mesh.
     """
 
-    def __init__(self, hand: Mapping[str, bytes], frames: HandFrames, objects: Sequence[SceneObject]) -> None:
+    def __init__(
+        self,
+        hand: Mapping[str, bytes],
+        pieces: Mapping[str, Mapping[str, bytes]],
+        frames: HandFrames,
+        objects: Sequence[SceneObject],
+    ) -> None:
         mujoco = import_mujoco("mjcf")
         self._mujoco = mujoco
         self._objects = [f"object_{place}_{item.code}" for place, item in enumerate(objects)]
         robot = etree.fromstring(hand["hand/hand.urdf"])
         for mesh in robot.iter("mesh"):
             mesh.set("filename", f"hand/{mesh.get('filename')}")
+        for link in robot.iter("link"):
+            for element in link.findall("collision") if link.get("name") in pieces else ():
+                link.remove(element)
         set_compiler(robot, meshdir="../")  # of the export, seen from the scenes
         files = dict(hand)
+        for own in pieces.values():
+            files |= own
         for item in objects:
             files |= {item.mesh: item.text, **item.pieces}
         try:
@@ -106,8 +129,13 @@ class MjcfScene:
             set_options(mujoco, spec, _PROTOCOL)
             for joint in spec.joints:
                 set_joint(mujoco, joint, _PROTOCOL)
+            for body in spec.bodies[1:]:
+                body.gravcomp = 1.0
+            for link, own in pieces.items():
+                _add_pieces(mujoco, spec, spec.body(link), f"{link} piece", own)
             for name in frames.joint_names:  # controls come in the order of q
-                add_drive(mujoco, spec, spec.joint(name), _PROTOCOL, _PROTOCOL.stiffness)
+                stiffer = _HELD_STIFFER if name in frames.held else 1.0
+                add_drive(mujoco, spec, spec.joint(name), _PROTOCOL, stiffer * _PROTOCOL.stiffness)
             for name, item in zip(self._objects, objects, strict=True):
                 _add_object(mujoco, spec, name, item)
             for geom in spec.geoms:
@@ -173,10 +201,14 @@ def _add_object(mujoco, spec: "mujoco.MjSpec", name: str, item: SceneObject) -> 
         body.add_geom(name=name, meshname=name, **shape)
         return
     body.add_geom(name=name, meshname=name, contype=0, conaffinity=0, group=2, **shape)
-    for number, file in enumerate(item.pieces):
+    _add_pieces(mujoco, spec, body, name, item.pieces, group=3)
+
+
+def _add_pieces(mujoco, spec: "mujoco.MjSpec", body: Any, name: str, files: Iterable[str], **options: Any) -> None:
+    for number, file in enumerate(files):
         piece = f"{name}_{number}"
         spec.add_mesh(name=piece, file=file)
-        body.add_geom(name=piece, meshname=piece, group=3, **shape)
+        body.add_geom(name=piece, meshname=piece, type=mujoco.mjtGeom.mjGEOM_MESH, **options)
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:
@@ -187,7 +219,7 @@ class MjcfWriter:
     """Writes ``grasps/NUMBER.xml`` for every row, numbered over the whole export.
 
     Args:
-        cut: Convex pieces of an object; without it the hull of its mesh collides.
+        cut: Cuts objects and the hand; without it the hulls of their meshes collide.
 
     Raises:
         PhysicsError: MuJoCo is not installed, or refuses the hand or an object, of the first row at once.
@@ -199,9 +231,14 @@ class MjcfWriter:
         import_mujoco("mjcf")  # before objects are cut, which takes long
         self._selection, self._frames, self._cut = selection, frames, cut
         self._hand = {f"{HAND}/{name}": data for name, data in hand_files(selection.hand, selection.shards[0]).items()}
+        number = count()
+        self._pieces = {
+            link: {f"{HAND}/pieces/piece_{next(number):02d}.obj": _hull_text(vertices) for vertices in own}
+            for link, own in (cut.hand(selection.hand) if cut else {}).items()
+        }
         self._object = cache(self._make_object)
         self._scene = lru_cache(maxsize=16)(
-            lambda objects: MjcfScene(self._hand, frames, [*map(self._object, objects)])
+            lambda objects: MjcfScene(self._hand, self._pieces, frames, [*map(self._object, objects)])
         )
         index = next(selection.batches()).object_index[0]
         self._scene(tuple(index[index >= 0].tolist()))
@@ -209,9 +246,9 @@ class MjcfWriter:
     def __call__(self, out: Path, advance: Callable[[int], None]) -> None:
         """Write into the folder of an export, calling ``advance`` with numbers of rows that are done."""
         frames = self._frames
-        for place in range(len(self._selection.objects)):
-            for name, data in self._object(place).pieces.items():
-                write_file(out / name, data)
+        objects = (self._object(place).pieces for place in range(len(self._selection.objects)))
+        for name, data in chain.from_iterable(pieces.items() for pieces in (*self._pieces.values(), *objects)):
+            write_file(out / name, data)
         for batch in self._selection.batches():
             in_root = [inverse(frames.root_in_object(pose, batch.q)) for pose in np.moveaxis(batch.object_pose, 1, 0)]
             poses = np.stack(in_root, axis=1)  # (n, O, 7), NaN where absent
@@ -229,14 +266,18 @@ class MjcfWriter:
 
     def _make_object(self, place: int) -> SceneObject:
         item = self._selection.objects[place]
-        hulls = [Trimesh(vertices).convex_hull for vertices in (self._cut(item.mesh()) if self._cut else ())]
+        pieces = self._cut.object(item.mesh()) if self._cut else ()
         return SceneObject(
             code=item.code,
             mesh=f"{OBJECTS}/{item.code}.obj",
             text=object_text(item).encode(),
-            pieces={f"{OBJECTS}/{item.code}/piece_{i:02d}.obj": mesh_text(h).encode() for i, h in enumerate(hulls)},
+            pieces={f"{OBJECTS}/{item.code}/piece_{i:02d}.obj": _hull_text(v) for i, v in enumerate(pieces)},
             body=mass_properties(item.mesh().vertices, item.mesh().faces),
         )
+
+
+def _hull_text(vertices: np.ndarray) -> bytes:
+    return mesh_text(Trimesh(vertices).convex_hull).encode()
 
 
 def read_mjcf(path: Path | str, *, joint_names: Sequence[str] | None = None) -> GraspSet:

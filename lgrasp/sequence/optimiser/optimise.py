@@ -140,7 +140,7 @@ def _weights(params: OptimiserParams) -> np.ndarray:
     """Weights of the energies in each step, (S, 6)."""
     growth = np.linspace(0, 1, params.iterations)
     first, last = params.w_hop
-    hop = first ** (1 - growth) * last**growth
+    hop = first + (last - first) * growth if params.w_hop_growth == "linear" else first ** (1 - growth) * last**growth
     others = {"fc": params.w_fc, "dis": params.w_dis, "hsp": params.w_hsp, "joint": params.w_joint, "oop": params.w_oop}
     return np.column_stack([hop if name == "hop" else np.full_like(hop, others[name]) for name in TERMS])
 

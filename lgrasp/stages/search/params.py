@@ -32,13 +32,16 @@ class SearchParams(Params):
     )
     threshold: float = Field(default=0.1, gt=0, le=1, description="Squared residual at which a set is taken.")
     gswo_share: float = Field(
-        default=6 / 7, gt=0, le=1, description="Largest gswo residual of a set, in round cones, over bounds.max_gswo."
+        default=6 / 7,
+        gt=0,
+        le=1,
+        description="swap: largest gswo residual of a set, in round cones, over bounds.max_gswo.",
     )
     least_force: float = Field(
-        default=0.03, ge=0, le=0.5, description="Smallest share of the normal force on a contact."
+        default=0.03, ge=0, le=0.5, description="swap: smallest share of the normal force on a contact."
     )
     sweeps: int = Field(default=5, ge=0, le=1000, description="mutate: passes over the contacts of a start.")
-    pivots: int = Field(default=3, ge=1, le=64, description="mutate: contacts moved in a sweep, one after another.")
+    pivots: int = Field(default=3, ge=1, le=64, description="mutate: contacts moved in a sweep, the first of a set.")
     mutations: int = Field(
         default=6, ge=1, le=1024, description="mutate: points tried for a contact, of which the best counts."
     )

@@ -17,6 +17,7 @@ from support.places import TINY_SHARD
 
 from lgrasp.dataset.exports.formats import FORMATS, export_shards, read_grasps
 from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.dataset.exports.plain_hand import plain_hand
 from lgrasp.geometry.poses import pose_matrix
 from lgrasp.object.mass import mass_properties
@@ -218,6 +219,25 @@ def test_scenes_hold_their_grasps(tmp_path):
             mujoco.mj_step(model, data)
         kept += np.linalg.norm(data.body("object_0_tiny").xpos - start) < 0.02
     assert kept >= 9
+
+
+def test_scenes_collide_and_weigh_as_the_protocol(tmp_path, shards):
+    """Links that their hulls would fill collide with the pieces given; the wrist stays, links do not sag."""
+    mujoco = pytest.importorskip("mujoco")
+    shard = shards.make(tmp_path / "a.h5", "shadow", n=1)
+    boxes = [trimesh.creation.box((0.01, 0.01, 0.01)).apply_translation((x, 0, 0)).vertices for x in (0.0, 0.02)]
+    cut = Cut(lambda _: [], lambda hand: {hand.base_link: boxes})
+    export_shards(tmp_path / "a.h5", tmp_path / "out", "mjcf", cut=cut)
+    assert [path.name for path in sorted((tmp_path / "out/hand/pieces").iterdir())] == ["piece_00.obj", "piece_01.obj"]
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out/grasps/00000000.xml"))
+    palm = model.body(shard.hand.base_link)
+    assert palm.geomnum[0] == 2
+    heavy = [model.body(b).name for b in np.flatnonzero(model.body_gravcomp != 1)]
+    assert [name.split("_")[0] for name in heavy] == ["world"] + ["object"] * (len(heavy) - 1)
+    stiff = {model.actuator(i).name: model.actuator_gainprm[i, 0] for i in range(model.nu)}
+    wrist = {name for name, kp in stiff.items() if kp == pytest.approx(5000)}
+    assert {"WR" in name for name in wrist} == {True}
+    assert {kp for name, kp in stiff.items() if name not in wrist} == {5.0}
 
 
 @pytest.mark.parametrize(("suffix", "kind"), [("glb", "glb"), ("PLY", "ply"), ("stl", "stl_ascii"), ("STL", "stl")])
