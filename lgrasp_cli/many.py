@@ -30,8 +30,15 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
     if dry_run:
         show_plans(requests, how)
         return
-    results = []
-    with how.spread(requests) as each:
+    from lgrasp.files import before_end  # not before something runs
+
+    results: list[dict[str, Any]] = []
+
+    def interrupted() -> None:  # while a job is not yet at work
+        begun = map(_described, requests[len(results) : len(results) + 1])
+        _report([*results, *(one | {"status": "interrupted", "error": "", "exit_code": 130} for one in begun)], how)
+
+    with how.spread(requests) as each, before_end(interrupted):
         for number, (request, own) in enumerate(zip(requests, each, strict=True), 1):
             if not how.quiet:
                 typer.echo(f"[{number}/{len(each)}] {request.title}", err=True)
@@ -39,12 +46,21 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
             results.append(_run_one(request, own))
             if results[-1]["exit_code"] == 130:
                 break
+    if code := _report(results, how):
+        raise typer.Exit(code)
+
+
+def _report(results: list[dict[str, Any]], how: How) -> int:
+    """Show what came of jobs; the worst exit code."""
     code = max(result["exit_code"] for result in results)
     columns = ("job", "what", "requested", "rows", "wall s", "strict/s", "status")
     table = TextTable(columns, map(_row, results), right=columns[2:6])
     print_report({"jobs": results, "exit_code": code}, how.json_path, () if how.quiet else [table])
-    if code:
-        raise typer.Exit(code)
+    return code
+
+
+def _described(request: "Request") -> dict[str, Any]:
+    return {"title": request.title, "unit": request.unit}
 
 
 def show_plans(requests: "Sequence[Request]", how: How) -> None:
@@ -69,7 +85,7 @@ def show_plans(requests: "Sequence[Request]", how: How) -> None:
 
 def _run_one(request: "Request", how: How) -> dict[str, Any]:
     """The report of a job with its status, one line of why, and exit code."""
-    data: dict[str, Any] = {"title": request.title, "unit": request.unit}
+    data = _described(request)
     status, text, code = "done", "", 0
     try:
         job = how.checked(request)

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from lgrasp.files import discard_temporaries
 from lgrasp.hand.find import find_hand
 from lgrasp.object.find import find_object
 from lgrasp_cli.working import run_job
@@ -102,6 +103,23 @@ def test_a_job_that_breaks_does_not_end_the_others(cli, quick, monkeypatch):
     made = cli("generate", *objects, "-p", quick, "-n", 4, "--device", "cpu", "--json", "-")
     assert (made.code, [job["status"] for job in json.loads(made.out)["jobs"]]) == (1, ["failed", "done"])
     assert "unexpected ValueError: what nobody expects" in made.err
+
+
+def test_a_process_ended_while_it_loads_reports_the_jobs_before(cli, quick, monkeypatch, tmp_path):
+    def ended(job, how):
+        if "sphere" in str(job.object):
+            discard_temporaries()  # all that is done when a signal ends the process
+        return run_job(job, how)
+
+    monkeypatch.setattr("lgrasp_cli.many.run_job", ended)
+    seen = []
+    monkeypatch.setattr("lgrasp_cli.many.print_report", lambda data, *_: seen.append(data))
+    objects = ("--object", "tiny", "--object", "sphere")
+    cli("generate", *objects, "-p", quick, "-n", 4, "--device", "cpu")
+    first, last = ([(job["status"], job["exit_code"]) for job in data["jobs"]] for data in seen)
+    assert first == [("done", 0), ("interrupted", 130)]
+    assert last == [("done", 0), ("done", 0)]
+    assert [data["exit_code"] for data in seen] == [130, 0]
 
 
 def test_what_holds_nothing(cli, tmp_path):
