@@ -13,6 +13,9 @@ OBJECTS_HELD = "objects"
 """The number of objects in the hand, as if it were a column."""
 
 _VALID = "metrics/valid"
+ALL = f"{_VALID} >= 0"
+"""A condition that all rows satisfy, also those that fail a bound."""
+
 _OPERATORS: dict[str, np.ufunc] = {">=": np.greater_equal, "<=": np.less_equal, "==": np.equal, "!=": np.not_equal}
 _OPERATORS |= {">": np.greater, "<": np.less}
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -40,6 +43,8 @@ class Condition(NamedTuple):
         Raises:
             ShardError: The shard has no such column, or not one number per row.
         """
+        if self.column == _VALID and _VALID not in reader.columns:  # nothing fails a bound
+            return np.full(len(reader), bool(_OPERATORS[self.operator](1, self.value)))
         single = [OBJECTS_HELD, *(name for name, (shape, _) in reader.columns.items() if len(shape) == 1)]
         if self.column not in single:
             known = f"with one number per row it has {', '.join(single)}"
@@ -59,12 +64,17 @@ def satisfied(reader: ShardReader, where: Sequence[Condition]) -> np.ndarray:
     Raises:
         ShardError: As of :meth:`Condition.holds`.
     """
-    good = np.ones(len(reader), bool)
-    if _VALID in reader.columns and all(condition.column != _VALID for condition in where):
-        good = reader.column(_VALID) != 0
+    good = not_negative(reader, where)
     for condition in where:
         good &= condition.holds(reader)
     return good
+
+
+def not_negative(reader: ShardReader, where: Sequence[Condition]) -> np.ndarray:
+    """Rows that do not fail a bound, bool, shape [N]; all, if a condition names metric ``valid``."""
+    if _VALID in reader.columns and all(condition.column != _VALID for condition in where):
+        return reader.column(_VALID) != 0
+    return np.ones(len(reader), bool)
 
 
 def parse_condition(text: str) -> Condition:

@@ -33,6 +33,11 @@ class Source(NamedTuple):
     """Id, hash and scale."""
     space_names: tuple[str, ...] | None
     columns: dict[str, tuple[tuple[int, ...], np.dtype]]
+    failed_bounds: tuple[str, ...]
+
+
+_OF_VALID = {"metrics/valid": 1.0, "metrics/failed_bound": 0.0}
+"""What labels are of a valid row: shards without negatives have none."""
 
 
 class TorchRows:
@@ -63,7 +68,7 @@ class TorchRows:
             raise ConfigError(f"part '{part}' is of no split: give split as well")
         self._negatives, self._part = negatives, part or "train"
         self._split = split if split is None or isinstance(split, Split) else Split.read(split)
-        found = [shard.value for shard in gather(paths, self._survey, invalid=negatives)]
+        found = _labelled([shard.value for shard in gather(paths, self._survey, invalid=negatives)], negatives)
         self._sources = [source for source in found if source.rows] if self._split else found
         if not self._sources:
             raise ShardError(f"{found[0].path}: no row is in part '{self._part}' of the split ({len(found)} shards)")
@@ -77,9 +82,9 @@ class TorchRows:
         """Id, SHA-256 of the source mesh and scale of every object."""
         self.space_names: tuple[str, ...] | None = first.space_names
         """Opposition spaces of the hand, if the first shard is of sequences."""
-        with self._open(first) as reader:
-            self.failed_bounds: tuple[str, ...] = tuple(reader.rows(0, 0).failed_bounds)
-        """Names of the numbers in ``metrics/failed_bound``, if the first shard has it."""
+        named = (source.failed_bounds for source in self._sources if source.failed_bounds)
+        self.failed_bounds: tuple[str, ...] = next(named, ())
+        """Names of the numbers in ``metrics/failed_bound``, if a shard has it."""
         self.columns: list[str] = self._choose(columns)
         self._tails = {n: widest(source.columns[n][0][1:] for source in self._sources) for n in self.columns}
 
@@ -118,6 +123,9 @@ class TorchRows:
         block: dict[str, torch.Tensor] = {}
         with self._open(source) as reader:
             for name in self.columns:
+                if name not in reader.columns:  # all rows are valid
+                    block[name] = torch.full((stop - start,), _OF_VALID[name])
+                    continue
                 values = reader.column(name, start, stop)
                 if name == "object_index":
                     known = np.array([*(self.objects.index(o) for o in source.objects), -1], dtype=values.dtype)
@@ -133,7 +141,19 @@ class TorchRows:
         if self._split:
             reader.take(self._split.holds(self._part, reader))
         hand = str(reader.attributes["hand_sha256"])
-        return Source(reader.path, len(reader), hand, reader.object_keys, reader.space_names, reader.columns)
+        bounds = tuple(reader.rows(0, 0).failed_bounds) if self._negatives else ()
+        spaces = reader.space_names
+        return Source(reader.path, len(reader), hand, reader.object_keys, spaces, dict(reader.columns), bounds)
+
+
+def _labelled(sources: list[Source], negatives: bool) -> list[Source]:
+    """Shards without negatives have the labels, too, that others of them have."""
+    if negatives:
+        for name in _OF_VALID:
+            if any(name in source.columns for source in sources):
+                for source in sources:
+                    source.columns.setdefault(name, ((source.rows,), np.dtype(np.float32)))
+    return sources
 
 
 class GraspDataset(TorchRows, torch.utils.data.Dataset):

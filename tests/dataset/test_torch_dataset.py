@@ -63,6 +63,25 @@ def test_rows_that_fail_a_bound_are_left_out(tmp_path, make_sequence):
         assert new == -1 if old == -1 else taken[new] == old
 
 
+def test_shards_with_and_without_negatives(tmp_path, make_shard):
+    """All rows of a shard without negatives are valid: the labels of the others are theirs, too."""
+    shard, codes = make_shard(4), np.array([0, 2, 0, 1], "f4")
+    metrics = shard.grasps.metrics | {"valid": (codes == 0).astype("f4"), "failed_bound": codes}
+    units = shard.grasps.metric_units | {"valid": "", "failed_bound": "code: 0 none, 1 max_gap, 2 max_gswo"}
+    failing = replace(shard, grasps=replace(shard.grasps, metrics=metrics, metric_units=units))
+    for names in (("a", "b"), ("b", "a")):
+        folder = tmp_path / "".join(names)
+        for name, one in zip(names, (shard, failing), strict=True):
+            write_shard(folder / f"{name}.h5", one)
+        data = GraspDataset(folder, columns=["metrics/valid", "metrics/failed_bound"], negatives=True)
+        assert data.failed_bounds == ("none", "max_gap", "max_gswo")
+        rows = [(int(row["metrics/valid"]), int(row["metrics/failed_bound"])) for row in data]
+        bare, labelled = [(1, 0)] * 4, [(1, 0), (0, 2), (1, 0), (0, 1)]
+        assert rows == (bare + labelled if names == ("a", "b") else labelled + bare)
+        assert "metrics/valid" in GraspDataset(folder, negatives=True)[0]
+        assert len(GraspDataset(folder)) == 6
+
+
 def test_numbers_of_either_byte_order(tmp_path, make_shard):
     write_shard(tmp_path / "a.h5", make_shard(5))
     q = read_shard(tmp_path / "a.h5").grasps.q

@@ -158,6 +158,7 @@ def write_index(
         "rows": selection.rows,
         "shards": [path.name for path in selection.shards],
         "where": list(conditions),
+        "negatives_left_out": selection.negatives,
         "run_key": run_key,
         "hand": {
             "name": selection.hand.name,
@@ -219,11 +220,12 @@ def readme(selection: Selection, frames: HandFrames, notes: str, conditions: Seq
     mimics = [f"  {name} = {m:g} * {source} + {b:g}" for name, (source, m, b) in frames.mimics.items()]
     heading = "Joints that follow others (<mimic> in hand.urdf), which have no value of their own:"
     counts = zip(selection.objects, selection.counts, strict=True)
+    negatives = f"; {selection.negatives:,} with metric valid 0 are left out" if selection.negatives else ""
     return _TEXT.format(
         rows=selection.rows,
         hand=selection.hand.name,
         shards=listed([path.name for path in selection.shards], _FEW),
-        chosen=f", only rows with {' and '.join(conditions)}" if conditions else "",
+        chosen=(f", only rows with {' and '.join(conditions)}" if conditions else "") + negatives,
         hand_folder=HAND,
         objects_folder=OBJECTS,
         objects=listed([f"{item.code} ({count:,})" for item, count in counts], _FEW),

@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
-from lgrasp.dataset.conditions import parse_condition
+from lgrasp.dataset.conditions import ALL, parse_condition
 from lgrasp.dataset.exports.card import publish
 from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
@@ -35,6 +35,8 @@ from lgrasp.dataset.files import Paths
 from lgrasp.dataset.split import Split
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.files import write_file
+from lgrasp.notices import notice
+from lgrasp.words import plural
 
 
 class Format(NamedTuple):
@@ -126,6 +128,9 @@ def export_shards(
         check_empty(out, run_key)
     parts = Split.read(split) if split is not None else None
     selection = select_rows(paths, where=conditions, limit=limit, single=form.single, split=parts)
+    if selection.negatives:
+        left = plural(selection.negatives, "row")
+        notice(f"{left} left out, as metric valid is 0; with --where '{ALL}' all are taken")
     selection = replace(selection, hand=plain_hand(selection.hand))
     frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
     write = form.writer(selection, frames, cut)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset.conditions import OBJECTS_HELD, Condition, satisfied
+from lgrasp.dataset.conditions import OBJECTS_HELD, Condition, not_negative, satisfied
 from lgrasp.dataset.exports.hand import free_name
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.gather import gather
@@ -99,6 +99,8 @@ class Selection:
     """Names of the parts of the split; one, ``train``, without a split."""
     numbers: tuple[str, ...]
     """Flat names of the metrics and verdicts with one number per row that all shards have, and ``candidate``."""
+    negatives: int
+    """Rows with metric ``valid`` 0 of these shards that were left out, as no condition names it."""
     _sources: tuple[_Source, ...]
 
     @property
@@ -196,16 +198,16 @@ def select_rows(
     known: dict[tuple[str, str, float], ExportObject] = {}
     sources: list[_Source] = []
     numbers: dict[str, None] | None = None
-    chosen = seen = 0
+    chosen = seen = negatives = 0
 
-    def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-        """The rows that conditions leave, their ``object_index`` and parts, and the number of all rows."""
+    def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, int]:
+        """The rows that conditions leave, their ``object_index`` and parts; how many there are, and are negatives."""
         reader.check_whole()
         rows, index = chosen_rows(reader, where, single=single)
         parts = np.zeros(len(reader), int) if split is None else split.numbers(reader)
-        return rows, index, parts[rows], len(reader)
+        return rows, index, parts[rows], len(reader), int((~not_negative(reader, where)).sum())
 
-    for path, _, (rows, index, part, number) in gather(paths, look):
+    for path, _, (rows, index, part, number, failing) in gather(paths, look):
         with ShardReader(path) as reader:
             this = reader.hand()
             hand, source = hand or this, source or path
@@ -220,6 +222,7 @@ def select_rows(
         rows = rows[: None if limit is None else limit - chosen]
         index, part = index[: len(rows)], part[: len(rows)]
         seen += number
+        negatives += failing
         planes = [record.tables for record in records]
         sources.append(_Source(path, rows, places[index], columns, chosen, planes, on_table, part))
         if len(rows):
@@ -245,6 +248,7 @@ def select_rows(
         single=single,
         parts=("train",) if split is None else tuple(split.parts),
         numbers=tuple(numbers or ()),
+        negatives=negatives,
         _sources=tuple(s._replace(index=place[s.index]) for s in sources if len(s.rows)),
     )
 
