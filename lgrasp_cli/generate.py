@@ -10,7 +10,18 @@ from lgrasp.choices import PalmUse, ScoreName, ThumbPlace
 from lgrasp.words import plural
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import GRASP_TYPE, HANDS, OBJECTS, one_of
-from lgrasp_cli.options import Contacts, DryRun, PipelineName, Scale, Seed, Settings, Simulate, choose_pipeline, given
+from lgrasp_cli.options import (
+    Contacts,
+    DryRun,
+    PipelineName,
+    Scale,
+    Seed,
+    Settings,
+    Simulate,
+    choose_pipeline,
+    given,
+    refuse_twice,
+)
 from lgrasp_cli.tables import Block, closed, counted, following, held, place, took
 from lgrasp_cli.working import How, working
 
@@ -143,6 +154,11 @@ def generate(
     from lgrasp.jobs.config import pair_requests
     from lgrasp.object.find import all_objects
 
+    told = {"contacts": contacts, "passes": passes, "score": score}
+    refuse_twice(settings, {f"search.{name}": name for name in told if told[name] is not None})
+    refuse_twice(settings, {"place.table": "table"} if table else {})
+    refuse_twice(settings, {"search.contacts": "fingers"} if fingers else {})
+    refuse_twice(settings, {"search.contacts": "grasp-type"} if grasp_type else {})
     chosen = choose_pipeline(pipeline, seed, contacts, settings)
     chosen = chosen.with_params("search", **given(passes=passes, score=score))
     chosen = chosen.with_simulation(simulate) if simulate else chosen

@@ -33,7 +33,9 @@ def render(
     out: Annotated[Path, Option("--out", "-o", help="File to write: .png, .jpg, .webp, or .gif, which moves.")] = Path(
         "grasps.png"
     ),
-    count: Annotated[int, Option("-n", min=1, max=400, help="Rows to draw, spread evenly over all.")] = 16,
+    count: Annotated[
+        int | None, Option("-n", min=1, max=400, help="Rows to draw, spread evenly over all; default: 16.")
+    ] = None,
     rows: Annotated[str | None, Option(help="Numbers of rows, counted through all shards, such as 0,5,9.")] = None,
     stage: Annotated[StageName | None, Option(help="Posture of the hand; default: grasp; a .gif shows all.")] = None,
     size: Annotated[int, Option(min=32, max=2048, help="Pixels of a side of each picture.")] = 256,
@@ -47,15 +49,18 @@ def render(
     Example: lgrasp render grasps/allegro-mug/robust -n 16 --out grid.png
     """
     from lgrasp.dataset.scenes import SceneRows, draw_motion
+    from lgrasp.errors import ConfigError
     from lgrasp.files import write_file
     from lgrasp.picture.scene import STAGES
     from lgrasp.picture.sheet import check_image, gif_bytes, image_bytes
     from lgrasp_cli.progress import Bar
 
     check_image(out)
+    if count is not None and rows is not None:
+        raise ConfigError(f"-n {count}: --rows {rows} says already which rows; give one of them")
     moving = out.suffix.lower() == ".gif" and stage is None
     found = SceneRows(paths)
-    chosen = found.sound(found.spread(count)) if rows is None else _numbers(rows)
+    chosen = found.sound(found.spread(count or 16)) if rows is None else _numbers(rows)
     with Bar(quiet=quiet) as bar:
         images = draw_motion(
             found,

@@ -1,7 +1,7 @@
 """Options that several commands share, with one wording each."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -41,7 +41,10 @@ Scale = Annotated[float, Option(help="Factor from the mesh's unit to metres (0.0
 Device = Annotated[str, Option(help="auto: the first GPU, else the CPU.", **DEVICE)]
 Workers = Annotated[int, Option(min=0, help="Threads or processes; 0: as suits the device.")]
 CacheDir = Annotated[Path | None, Option(help="Folder of the cache; default: LGRASP_CACHE_DIR, else the user's.")]
-Contacts = Annotated[str | None, Option(help="How many fingers touch: numbers to draw from, such as 3,4 or 3:5.")]
+Contacts = Annotated[
+    str | None,
+    Option(help="How many fingers touch: one of these numbers, such as 3,4 or 3:5 (power: more or less)."),
+]
 JsonPath = Annotated[
     str | None,
     Option("--json", metavar="PATH", help="Also write the report as JSON; - prints it instead of the table."),
@@ -157,6 +160,16 @@ def position(text: str | None) -> list[float] | None:
         return None if text is None else list(comma_numbers(text, 3))
     except ValueError as error:
         raise ConfigError(f"--viewpoint '{text}': {error}, such as 0,0,0.7") from None
+
+
+def refuse_twice(settings: Sequence[str] | None, options: Mapping[str, str]) -> None:
+    """Raises ConfigError if --set sets what an option sets; ``options``: parameters that some set, with their names."""
+    from lgrasp.errors import ConfigError
+
+    for setting in settings or ():
+        key = setting.partition("=")[0].strip()
+        if key in options:
+            raise ConfigError(f"--set {setting}: --{options[key]} says that already; give one of them")
 
 
 def choose_pipeline(

@@ -76,8 +76,10 @@ def own_policy(pipeline: Pipeline, hand: HandSource) -> Path | None:
 def _within_reach(pipeline: Pipeline, source: HandSource, fingers: int) -> Pipeline:
     search, palm = pipeline.params("search"), bool(source.spec.palm.links)
     name, asked = ("contacts", source.spec.contacts) if search.usual_contacts else ("search.contacts", search.contacts)
-    if asked and min(asked) > (most := max(FEWEST_CONTACTS, fingers)):
-        notice(f"hand '{source.name}': {name} is {most}, not {min(asked)}: its fingers")
+    most = max(FEWEST_CONTACTS, fingers)
+    lowered = sorted({str(k) for k in asked or () if k > most})
+    if lowered and "close" not in pipeline.order:  # there each finger touches where it does
+        notice(f"hand '{source.name}': {name} is {most}, not {' or '.join(lowered)}: its fingers")
     if "close" in pipeline.order:  # each finger touches once
         fingers, palm = len(pipeline.steer.fingers) or fingers, palm and pipeline.steer.palm != "no"
     least, most = pipeline.bounds.min_contacts, max(FEWEST_CONTACTS, fingers + palm)

@@ -108,7 +108,7 @@ class Steering(Params):
     @classmethod
     def _is_there(cls, value: Path | None) -> Path | None:
         if value is not None and not user_path(value).is_file():
-            raise ValueError("no such file")
+            raise ValueError("a folder; give one file" if user_path(value).is_dir() else "no such file")
         return value and user_path(value)
 
     @model_validator(mode="after")

@@ -2,8 +2,6 @@
 
 import shutil
 
-import pytest
-
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.hand.find import find_hand
 from lgrasp.jobs.hands import for_hand
@@ -22,9 +20,8 @@ def test_more_contacts_than_fingers_in_the_rules_of_the_hand_are_told(said, tmp_
     assert said == ["hand 'allegro': contacts is 4, not 9: its fingers"]
 
 
-@pytest.mark.parametrize("asked", [(2, 5), (4,)])
-def test_contacts_of_all_fingers_are_fine(said, asked):
-    for_hand(load_pipeline("robust").with_params("search", contacts=asked), "allegro")
+def test_contacts_of_all_fingers_are_fine(said):
+    for_hand(load_pipeline("robust").with_params("search", contacts=(2, 4)), "allegro")
     assert said == []
 
 

@@ -170,9 +170,12 @@ def test_the_judge_agrees_and_finds_rows_that_do_not_obey(steered):
 
 def test_refined_rows_are_free_but_stay_above_the_plane(steered, cache_root, tmp_path):
     _, path = steered(rows=6, fingers="thumb,index,middle", above="0,0,1,0.001")
-    cache = Cache(cache_root, pytest.fail)
+    said: list[str] = []
+    cache = Cache(cache_root, said.append)
     job = RefineJob(shards=(path.parent,), out=tmp_path / "refined", device="cpu", cache=cache)
-    (path,) = run_job(job).paths
+    assert said == []
+    source, (path,) = path, run_job(job).paths
+    assert said == [f"{source} was steered: refined rows touch wherever they came to"]
     assert read_shard(path).header.config["steered"] == {"above": [0, 0, 1, 0.001]}
     failed = judge(path).failed
     assert not any(failed[check].any() for check in ("steered", "table", "resting"))

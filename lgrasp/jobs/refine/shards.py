@@ -148,7 +148,9 @@ class RefineJob(RefineRequest, ShardJob):
         }
         config = {**shard.header.config, "bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
         if told := config.pop("steered", None):
-            config |= moved_rows(told)
+            config |= (kept := moved_rows(told))
+            if kept.get("steered") != told:
+                self.cache.warn(f"{part.source} was steered: refined rows touch wherever they came to")
         index = part.shard_index
         header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__, shard_index=index)
         # contacts are found anew, wherever they are

@@ -24,6 +24,7 @@ SearchValues = params_struct(
     floats="friction max_gswo max_unresisted_load min_self_distance torque_scale",
     contacts=vec_kinds,
     kinds=wp.int32,  # entries of ``contacts``
+    between=wp.int32,  # bit k: k is between two of them, and none
     least=wp.int32,  # fewest finger contacts
     min_contacts=wp.int32,  # of fingers' links and the palm
     more=wp.int32,  # contacts beyond these, where a pose has them

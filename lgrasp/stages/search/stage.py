@@ -216,6 +216,7 @@ def _values(params: SearchParams, context: Context) -> Any:
         context.bounds,
         contacts=vec_kinds(*params.contacts, *[0] * (MAX_KINDS - kinds)),
         kinds=kinds,
+        between=sum(1 << k for k in {*range(min(params.contacts), max(params.contacts))} - {*params.contacts}),
         more=0,
         least=context.steered.least,
         max_gswo=params.gswo_share * context.bounds.max_gswo,

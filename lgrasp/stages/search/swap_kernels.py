@@ -132,6 +132,8 @@ def _swapping(measure: Any) -> Any:
             return
         if n + _further(candidates, row, chosen) < least:
             return
+        if ((params.between >> k) & 1) == 1:
+            return  # a finger was added to 2 where 2 and 4 are asked for
         for g in range(G):
             tried_out.chosen[row, lane, g] = chosen[g]
         tried_out.score[row, lane] = score[0]

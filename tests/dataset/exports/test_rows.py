@@ -48,20 +48,20 @@ def test_conditions_and_limit(tmp_path, shards):
     assert (index["rows"], index["where"]) == (4, ["physics/fc_holds", "metrics/epsilon >= 0.5"])
 
 
-def test_negatives_are_left_out_and_told(tmp_path, shards, recwarn):
+def test_negatives_are_left_out_and_told(tmp_path, shards, monkeypatch):
     """Unless a condition names their metric; a shard without negatives has valid rows only."""
     made = [shards.make(tmp_path / f"{name}.h5", seed=seed) for seed, name in enumerate("ab")]
     rows = made[1].grasps
     metrics, units = rows.metrics | {"valid": np.array([1, 0, 1, 0, 1, 1], "f4")}, rows.metric_units | {"valid": ""}
     write_shard(tmp_path / "b.h5", replace(made[1], grasps=replace(rows, metrics=metrics, metric_units=units)))
-    q = np.concatenate([shard.grasps.q for shard in made])
+    q, told = np.concatenate([shard.grasps.q for shard in made]), []
+    monkeypatch.setattr("lgrasp.dataset.exports.formats.notice", told.append)
     for number, (where, rows) in enumerate(
         [((), [*range(7), 8, 10, 11]), (["metrics/valid >= 0"], range(12)), (["metrics/valid == 0"], [7, 9])]
     ):
         got = exported(tmp_path, tmp_path / f"out{number}", where=where)
         np.testing.assert_array_equal(got.q, q[list(rows)])
-        told = [str(one.message) for one in recwarn.list]
-        assert told == ["2 rows left out, as metric valid is 0; with --where 'metrics/valid >= 0' all are taken"]
+    assert told == ["2 rows left out, as metric valid is 0; with --where 'metrics/valid >= 0' all are taken"]
     assert "; 2 with metric valid 0 are left out" in (tmp_path / "out0" / "README.txt").read_text()
     assert json.loads((tmp_path / "out0" / "export.json").read_text())["negatives_left_out"] == 2
 

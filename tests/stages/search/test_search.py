@@ -162,6 +162,8 @@ def test_k_is_as_asked(tables, context):
     arrays = run(tables.ik, SearchParams(contacts=(2,)), context)[0].arrays()
     assert ((arrays["chosen"] >= 0).sum(1) <= 2).all()
     assert len(arrays["pose"]) > 5
+    asked = SearchParams(contacts=(2, 4), rounds=3)  # a third finger is added in vain unless a fourth is
+    assert {*(run(tables.ik, asked, context)[0].arrays()["chosen"] >= 0).sum(1).tolist()} == {2, 4}
 
 
 def test_too_many_candidates(tables, context, swift):
