@@ -113,7 +113,8 @@ def generate(
     batch: Annotated[int, Option(min=0, help="Candidates per batch; 0: as suits the device.")] = 0,
     simulate: Simulate = None,
     shard_rows: Annotated[
-        int, Option(help="Grasps per shard. Changing it changes which grasps are generated.")
+        int,
+        Option(help="Grasps per shard, which tries whole batches. Changing it changes which grasps are generated."),
     ] = 10_000,
     passes: Annotated[
         int | None,
