@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from support.jaws import Jaws
 from support.places import QUICK
 
 from lgrasp import notices
 from lgrasp.cloud import model
+from lgrasp.dataset.writer import write_shard
 from lgrasp.runtime.device import start
 from lgrasp.runtime.kernels import load_kernels
 from lgrasp_cli import progress
@@ -97,3 +99,12 @@ def process(shared_cache, tmp_path):
         )
 
     return begin
+
+
+@pytest.fixture
+def grasps(tmp_path):
+    """A folder of two shards: one grasp that holds, and two that press too little."""
+    jaws = Jaws(tmp_path)
+    write_shard(tmp_path / "grasps" / "jaws-cube-00000.h5", jaws.shard(0.004))
+    write_shard(tmp_path / "grasps" / "jaws-cube-00001.h5", jaws.shard(0.0001, count=2))
+    return tmp_path / "grasps"
