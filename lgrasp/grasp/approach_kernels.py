@@ -24,7 +24,7 @@ GPU_STRETCHES = 5
 """Parts of the way that a GPU looks at side by side."""
 
 _COARSE_STEPS = wp.constant(15)  # of all ways
-_STEPS = wp.constant(30)  # of the one that is taken, 5 mm each
+_STEPS = wp.constant(45)  # of the one that is taken, 3.3 mm each
 _SURE = wp.constant(1.0e-3)  # [m] of a distance in a grid
 _PARTS = wp.constant(8)  # of the way from q_pregrasp to q
 _LEAST_SINE = wp.constant(1.0e-3)
