@@ -155,19 +155,19 @@ def generate(
     from lgrasp.jobs.config import pair_requests
     from lgrasp.object.find import all_objects
 
-    told = {"contacts": contacts, "passes": passes, "score": score}
-    refuse_twice(settings, {f"search.{name}": name for name in told if told[name] is not None})
-    refuse_twice(settings, {"place.table": "table"} if table else {})
-    refuse_twice(settings, {"search.contacts": "fingers"} if fingers else {})
-    refuse_twice(settings, {"search.contacts": "grasp-type"} if grasp_type else {})
+    searching = given(contacts=contacts, passes=passes, score=score)
+    steering = given(grasp_type=grasp_type, fingers=fingers, links=links, palm=palm, thumb=thumb)
+    steering |= given(approach=approach, above=above, pose=pose, touch=touch or None, avoid=avoid or None)
+    told = {f"search.{name}": name for name in searching} | {f"steer.{name}": name for name in steering}
+    told |= {"place.table": "table"} if table else {}
+    if fingers or grasp_type:
+        told["search.contacts"] = "fingers" if fingers else "grasp-type"
+    refuse_twice(settings, told)
     chosen = choose_pipeline(pipeline, seed, contacts, settings)
     chosen = chosen.with_params("search", **given(passes=passes, score=score))
     chosen = chosen.with_simulation(simulate) if simulate else chosen
     chosen = chosen.with_table() if table else chosen
-    chosen = chosen.with_steering(
-        **given(grasp_type=grasp_type, fingers=fingers, links=links, palm=palm, thumb=thumb),
-        **given(approach=approach, above=above, pose=pose, touch=touch or None, avoid=avoid or None),
-    )
+    chosen = chosen.with_steering(**steering)
     for name in ("fingers", "grasp_type") if contacts is not None else ():
         if getattr(chosen.steer, name):
             flag = f"--{name.replace('_', '-')}"

@@ -1,5 +1,6 @@
 """Several jobs one after another: ``lgrasp run``, their progress, their plans, and one report of all."""
 
+import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,11 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
 
     results: list[dict[str, Any]] = []
 
-    def interrupted() -> None:  # while a job is not yet at work
+    once = threading.Lock()
+
+    def interrupted() -> None:  # while a job loads, or by a second signal, which two threads may see
+        if not once.acquire(blocking=False):
+            return
         begun = map(_described, requests[len(results) : len(results) + 1])
         _report([*results, *(one | {"status": "interrupted", "error": "", "exit_code": 130} for one in begun)], how)
 

@@ -169,7 +169,8 @@ def refuse_twice(settings: Sequence[str] | None, options: Mapping[str, str]) -> 
     for setting in settings or ():
         key = setting.partition("=")[0].strip()
         if key in options:
-            raise ConfigError(f"--set {setting}: --{options[key]} says that already; give one of them")
+            flag = f"--{options[key].replace('_', '-')}"
+            raise ConfigError(f"--set {setting}: {flag} says that already; give one of them")
 
 
 def choose_pipeline(

@@ -264,7 +264,7 @@ def sequence_page(result: dict[str, Any]) -> Page:
         tables += _object_tables(found["objects"], published | published.get(method.split()[0], {}))
     tables.append(_rate_table(result))
     notes = [
-        "hold/tried, hold/begun: of all attempts begun; the other shares are of what was left of them",
+        "hold/begun: of all attempts begun; hold/tried: of all steps tried with a space; the others: of what was left",
         "drawn: candidates for each attempt at this step; pass: of these, through the filter",
         "(...): published; strict: rows within the bounds of the pipeline, whether they hold or not",
         *caveats(result["published"]),

@@ -141,7 +141,8 @@ class TorchRows:
         if self._split:
             reader.take(self._split.holds(self._part, reader))
         hand = str(reader.attributes["hand_sha256"])
-        bounds = tuple(reader.rows(0, 0).failed_bounds) if self._negatives else ()
+        named = "metrics/failed_bound" in reader.columns
+        bounds = tuple(reader.rows(0, 0).failed_bounds) if named else ()
         spaces = reader.space_names
         return Source(reader.path, len(reader), hand, reader.object_keys, spaces, dict(reader.columns), bounds)
 

@@ -27,7 +27,7 @@ _HULL_ERROR = 4.0e-4  # a hull is thinned until this error [m]; inflating by hal
 _CYLINDER_SIDES = 32
 _SMALLEST = 5.0e-4  # [m] largest side of a mesh
 _MAX_BODIES = 16  # of one mesh
-_MOST_APART = 0.999  # bodies of one mesh lie apart if their union has more than this of their volumes
+_SUNK, _ROUNDING = 1.0e-3, 1.0e-6  # bodies of one mesh share as much of the smallest one's volume; of all volumes
 _SHARP_CELL, _MOST_SHARP = 0.002, 96
 _CREASE_ANGLE = 45.0  # [deg]
 _MIN_HULL_SHARE = 0.9  # a body that fills less of its hull ...
@@ -108,8 +108,9 @@ def one_solid(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if not 1 < mesh.body_count <= _MAX_BODIES:
         return mesh
     bodies = list(mesh.split(only_watertight=False))
-    outer = outer_mesh(bodies)
-    return outer if outer.is_volume and outer.volume < _MOST_APART * sum(body.volume for body in bodies) else mesh
+    outer, volumes = outer_mesh(bodies), [body.volume for body in bodies]
+    apart = sum(volumes) - max(_SUNK * min(volumes), _ROUNDING * sum(volumes))
+    return outer if outer.is_volume and outer.volume < apart else mesh
 
 
 def thin_mesh(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:

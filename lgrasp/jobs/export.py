@@ -99,7 +99,6 @@ class ExportJob(ExportRequest, Job):
 
         def of_hand(record: HandRecord) -> dict[str, list[np.ndarray]]:
             hand = hand_of_record(record, decompose)
-            cut = sorted(link for link in hand.cut if all(len(piece.planes) for piece in hand.pieces[link]))
-            return {link: [inflated(piece) for piece in hand.pieces[link]] for link in cut}
+            return {link: [inflated(piece) for piece in hand.pieces[link]] for link in sorted(hand.cut)}
 
         return Cut(of_object, of_hand)

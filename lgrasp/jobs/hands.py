@@ -45,7 +45,7 @@ def for_hand(pipeline: Pipeline, hand: str) -> Pipeline:
     """
     policy, steer, search = pipeline.params("place").policy, pipeline.steer, pipeline.params("search")
     steered = steer.grasp_type is not None or steer.thumb is not None or any(steer.sides.values())
-    contacts = max(pipeline.bounds.min_contacts, 0 if search.usual_contacts else min(search.contacts))
+    contacts = max(pipeline.bounds.min_contacts, 0 if search.usual_contacts else max(search.contacts))
     if not (pipeline.open_to_hands or policy or steered or contacts > FEWEST_CONTACTS):
         return pipeline  # of any hand: it need not be read
     source = hand_source(hand)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from lxml import etree
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -127,9 +128,12 @@ def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> No
 
 
 def inflated(piece: Piece) -> np.ndarray:
-    """Vertices (V, 3) of a hull grown by the piece's radius, a fraction of a millimetre."""
+    """Vertices (V, 3) of a hull grown by the piece's radius, a fraction of a millimetre; of balls and capsules about as
+    many."""
     if piece.radius == 0.0:
         return piece.vertices
+    if not len(piece.planes):
+        return (piece.vertices[:, None] + trimesh.creation.icosphere(2, piece.radius).vertices).reshape(-1, 3)
     hull = ConvexHull(piece.vertices)
     normals = np.zeros_like(piece.vertices)
     for face in hull.simplices.T:

@@ -345,6 +345,8 @@ def test_walls_of_one_body_inside_another_are_no_outside():
     boxes = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation((x, 0, 0)) for x in (0.0, 0.009)]
     apart = joined_mesh([boxes[0], boxes[1].copy().apply_translation((0.05, 0, 0))])
     assert one_solid(apart) is apart
+    small = [trimesh.creation.box([side] * 3).apply_translation((x, 0, 0)) for side, x in ((0.1, 0.2), (0.005, 0.01))]
+    assert one_solid(joined_mesh([boxes[0], *small])).body_count == 2  # sunk by half its side, beside a large one
     whole = one_solid(joined_mesh(boxes))
     assert whole.volume == pytest.approx(0.029 * 0.02**2)
     grid = link_grid([whole], "cpu")

@@ -102,11 +102,12 @@ def export_shards(
         out: Folder to write; it must be empty or not exist yet.
         to: A key of :data:`FORMATS`.
         where: Conditions on columns that a row must satisfy, all of them, such as ``physics/fc_holds`` or
-            ``metrics/epsilon > 0.01``.
+            ``metrics/epsilon > 0.01``. Rows with metric ``valid`` 0 are left out unless a condition names it.
         split: File of ``lgrasp dataset split``, whose parts become files of their own (webdataset).
         licence: Of the data set, by its SPDX identifier; with it the folder also has what publishing takes: a card
             (``README.md``), ``provenance.json`` and ``SHA256SUMS``.
-        cut: Convex pieces of an object, for formats that simulate; without it the hull of its mesh collides.
+        cut: Cuts objects and the hand into convex pieces, for formats that simulate; without it the hulls of their
+            meshes collide.
         run_key: Of the shards and options, to tell a later run that the export, whole or not, is its own; without it an
             export that was interrupted cannot be gone on with.
         replaces: A whole export that the folder holds goes when the first file of this one is written.
@@ -130,7 +131,7 @@ def export_shards(
     selection = select_rows(paths, where=conditions, limit=limit, single=form.single, split=parts)
     if selection.negatives:
         left = plural(selection.negatives, "row")
-        notice(f"{left} left out, as metric valid is 0; with --where '{ALL}' all are taken")
+        notice(f"{left} left out, as metric valid is 0; --where '{ALL}' takes them, too")
     selection = replace(selection, hand=plain_hand(selection.hand))
     frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
     write = form.writer(selection, frames, cut)

@@ -49,8 +49,8 @@ grasps/NUMBER.xml  MuJoCo scene of one grasp: mujoco.MjModel.from_xml_path(FILE)
   keyframe pregrasp  the hand before closing
   keyframe squeeze   the hand at the grasp, its actuators pressing on the object
   actuators          one position servo per joint of the list below, named as it is: 5 N m/rad (500 N/m for sliding
-                     joints), a thousand times that of joints between {root} and {base}, which do not give way;
-                     critically damped. Joints that follow others are tied by equality constraints.
+                     joints), critically damped. Joints that follow others are tied by equality constraints.
+                     Joints that carry link {base}, if there are any, are a thousand times as stiff.
   bodies             the links of hand.urdf under their names; object_PLACE_CODE, free, 0.1 kg. PLACE counts the objects
                      in the hand from 0, in the order in which they were taken; all are where they are at the grasp of
                      the last one, which keyframe pregrasp is before.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset.conditions import OBJECTS_HELD, Condition, not_negative, satisfied
+from lgrasp.dataset.conditions import ALL, OBJECTS_HELD, Condition, not_negative, satisfied
 from lgrasp.dataset.exports.hand import free_name
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.gather import gather
@@ -100,7 +100,7 @@ class Selection:
     numbers: tuple[str, ...]
     """Flat names of the metrics and verdicts with one number per row that all shards have, and ``candidate``."""
     negatives: int
-    """Rows with metric ``valid`` 0 of these shards that were left out, as no condition names it."""
+    """Rows that satisfy the conditions, and were left out as metric ``valid`` is 0 and no condition names it."""
     _sources: tuple[_Source, ...]
 
     @property
@@ -205,7 +205,10 @@ def select_rows(
         reader.check_whole()
         rows, index = chosen_rows(reader, where, single=single)
         parts = np.zeros(len(reader), int) if split is None else split.numbers(reader)
-        return rows, index, parts[rows], len(reader), int((~not_negative(reader, where)).sum())
+        failing = ~not_negative(reader, where)
+        for condition in where:
+            failing &= condition.holds(reader)
+        return rows, index, parts[rows], len(reader), int(failing.sum())
 
     for path, _, (rows, index, part, number, failing) in gather(paths, look):
         with ShardReader(path) as reader:
@@ -232,6 +235,8 @@ def select_rows(
             break
     assert hand is not None
     if not chosen:
+        if negatives:
+            raise ShardError(f"{source}: no rows to export; metric valid is 0 of all: --where '{ALL}' takes them")
         why = f"none satisfies {' and '.join(map(str, where))}" if where and seen else "there are none"
         of = f"{plural(len(sources), 'shard')}, {seen:,} rows"
         raise ShardError(f"{source}: no rows to export; {why} ({of})")

@@ -150,7 +150,7 @@ class RefineJob(RefineRequest, ShardJob):
         if told := config.pop("steered", None):
             config |= (kept := moved_rows(told))
             if kept.get("steered") != told:
-                self.cache.warn(f"{part.source} was steered: refined rows touch wherever they came to")
+                notice("steered rows may touch elsewhere, or face another way, where they are refined")
         index = part.shard_index
         header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__, shard_index=index)
         # contacts are found anew, wherever they are

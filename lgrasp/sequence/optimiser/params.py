@@ -10,7 +10,7 @@ from lgrasp.config import Params
 class OptimiserParams(Params):
     """Minimisation of the grasp energy from random starts; lengths in metres.
 
-    Weights and iterations are published ones, the rest is as in the authors' program.
+    Iterations and weights but ``w_hop`` are published ones, the rest is as in the authors' program.
     """
 
     iterations: int = Field(6000, ge=1, le=1_000_000, description="Steps for each object.")

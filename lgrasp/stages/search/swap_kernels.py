@@ -72,6 +72,7 @@ def _swapping(measure: Any) -> Any:
         for g in range(G):
             if usable.size[row, g] > 0:
                 available += 1
+        begun = k
         palm = candidates.poses.palm_surface[row]
         goal = wp.sqrt(params.threshold)
         score = measure(points, normals, n, params.friction, params.torque_scale)
@@ -132,7 +133,7 @@ def _swapping(measure: Any) -> Any:
             return
         if n + _further(candidates, row, chosen) < least:
             return
-        if ((params.between >> k) & 1) == 1:
+        if k > begun and ((params.between >> k) & 1) == 1:
             return  # a finger was added to 2 where 2 and 4 are asked for
         for g in range(G):
             tried_out.chosen[row, lane, g] = chosen[g]

@@ -61,7 +61,7 @@ def test_negatives_are_left_out_and_told(tmp_path, shards, monkeypatch):
     ):
         got = exported(tmp_path, tmp_path / f"out{number}", where=where)
         np.testing.assert_array_equal(got.q, q[list(rows)])
-    assert told == ["2 rows left out, as metric valid is 0; with --where 'metrics/valid >= 0' all are taken"]
+    assert told == ["2 rows left out, as metric valid is 0; --where 'metrics/valid >= 0' takes them, too"]
     assert "; 2 with metric valid 0 are left out" in (tmp_path / "out0" / "README.txt").read_text()
     assert json.loads((tmp_path / "out0" / "export.json").read_text())["negatives_left_out"] == 2
 
