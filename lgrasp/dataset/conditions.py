@@ -64,17 +64,18 @@ def satisfied(reader: ShardReader, where: Sequence[Condition]) -> np.ndarray:
     Raises:
         ShardError: As of :meth:`Condition.holds`.
     """
-    good = not_negative(reader, where)
+    return satisfied_or_invalid(reader, where)[0]
+
+
+def satisfied_or_invalid(reader: ShardReader, where: Sequence[Condition]) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`satisfied`, and the rows that only their metric ``valid`` leaves out, each shape [N]."""
+    good = np.ones(len(reader), bool)
     for condition in where:
         good &= condition.holds(reader)
-    return good
-
-
-def not_negative(reader: ShardReader, where: Sequence[Condition]) -> np.ndarray:
-    """Rows that do not fail a bound, bool, shape [N]; all, if a condition names metric ``valid``."""
-    if _VALID in reader.columns and all(condition.column != _VALID for condition in where):
-        return reader.column(_VALID) != 0
-    return np.ones(len(reader), bool)
+    if _VALID not in reader.columns or any(condition.column == _VALID for condition in where):
+        return good, np.zeros(len(reader), bool)
+    valid = reader.column(_VALID) != 0
+    return good & valid, good & ~valid
 
 
 def parse_condition(text: str) -> Condition:

@@ -33,7 +33,6 @@ class Source(NamedTuple):
     """Id, hash and scale."""
     space_names: tuple[str, ...] | None
     columns: dict[str, tuple[tuple[int, ...], np.dtype]]
-    failed_bounds: tuple[str, ...]
 
 
 _OF_VALID = {"metrics/valid": 1.0, "metrics/failed_bound": 0.0}
@@ -68,7 +67,11 @@ class TorchRows:
             raise ConfigError(f"part '{part}' is of no split: give split as well")
         self._negatives, self._part = negatives, part or "train"
         self._split = split if split is None or isinstance(split, Split) else Split.read(split)
-        found = _labelled([shard.value for shard in gather(paths, self._survey, invalid=negatives)], negatives)
+        found = [shard.value for shard in gather(paths, self._survey, invalid=negatives)]
+        self.failed_bounds: tuple[str, ...] = _failed_bounds(found)
+        """Names of the numbers in ``metrics/failed_bound``, if a shard has it."""
+        if negatives:
+            _label(found)
         self._sources = [source for source in found if source.rows] if self._split else found
         if not self._sources:
             raise ShardError(f"{found[0].path}: no row is in part '{self._part}' of the split ({len(found)} shards)")
@@ -82,9 +85,6 @@ class TorchRows:
         """Id, SHA-256 of the source mesh and scale of every object."""
         self.space_names: tuple[str, ...] | None = first.space_names
         """Opposition spaces of the hand, if the first shard is of sequences."""
-        named = (source.failed_bounds for source in self._sources if source.failed_bounds)
-        self.failed_bounds: tuple[str, ...] = next(named, ())
-        """Names of the numbers in ``metrics/failed_bound``, if a shard has it."""
         self.columns: list[str] = self._choose(columns)
         self._tails = {n: widest(source.columns[n][0][1:] for source in self._sources) for n in self.columns}
 
@@ -141,20 +141,23 @@ class TorchRows:
         if self._split:
             reader.take(self._split.holds(self._part, reader))
         hand = str(reader.attributes["hand_sha256"])
-        named = "metrics/failed_bound" in reader.columns
-        bounds = tuple(reader.rows(0, 0).failed_bounds) if named else ()
-        spaces = reader.space_names
-        return Source(reader.path, len(reader), hand, reader.object_keys, spaces, dict(reader.columns), bounds)
+        return Source(reader.path, len(reader), hand, reader.object_keys, reader.space_names, dict(reader.columns))
 
 
-def _labelled(sources: list[Source], negatives: bool) -> list[Source]:
+def _failed_bounds(sources: Sequence[Source]) -> tuple[str, ...]:
+    for source in sources:
+        if "metrics/failed_bound" in source.columns:
+            with ShardReader(source.path) as reader:
+                return tuple(reader.rows(0, 0).failed_bounds)
+    return ()
+
+
+def _label(sources: Sequence[Source]) -> None:
     """Shards without negatives have the labels, too, that others of them have."""
-    if negatives:
-        for name in _OF_VALID:
-            if any(name in source.columns for source in sources):
-                for source in sources:
-                    source.columns.setdefault(name, ((source.rows,), np.dtype(np.float32)))
-    return sources
+    for name in _OF_VALID:
+        if any(name in source.columns for source in sources):
+            for source in sources:
+                source.columns.setdefault(name, ((source.rows,), np.dtype(np.float32)))
 
 
 class GraspDataset(TorchRows, torch.utils.data.Dataset):

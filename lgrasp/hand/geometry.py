@@ -105,12 +105,17 @@ def link_meshes(urdf: Urdf, tree: Tree, link: str) -> list[trimesh.Trimesh]:
 
 def one_solid(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """A mesh, without the walls that closed bodies of it have inside one another: no wall there is near an outside."""
-    if not 1 < mesh.body_count <= _MAX_BODIES:
+    bodies = _bodies(mesh)
+    if len(bodies) == 1:
         return mesh
-    bodies = list(mesh.split(only_watertight=False))
     outer, volumes = outer_mesh(bodies), [body.volume for body in bodies]
     apart = sum(volumes) - max(_SUNK * min(volumes), _ROUNDING * sum(volumes))
     return outer if outer.is_volume and outer.volume < apart else mesh
+
+
+def _bodies(mesh: trimesh.Trimesh) -> list[trimesh.Trimesh]:
+    """The bodies of a mesh; itself, where it has one or too many."""
+    return list(mesh.split(only_watertight=False)) if 1 < mesh.body_count <= _MAX_BODIES else [mesh]
 
 
 def thin_mesh(mesh: trimesh.Trimesh, most: int) -> trimesh.Trimesh:
@@ -188,7 +193,7 @@ def convex_pieces(
     """
     if geometry.kind != "mesh":
         return [convex_piece(urdf, geometry, mesh)], ""
-    bodies = list(mesh.split(only_watertight=False)) if 1 < mesh.body_count <= _MAX_BODIES else [mesh]
+    bodies = _bodies(mesh)
     try:
         hulls = [convex_piece(urdf, geometry, body) for body in bodies]
     except HandError:

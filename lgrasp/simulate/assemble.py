@@ -128,8 +128,8 @@ def _add_piece(mujoco: Any, spec: Any, body: Any, piece: Piece, name: str) -> No
 
 
 def inflated(piece: Piece) -> np.ndarray:
-    """Vertices (V, 3) of a hull grown by the piece's radius, a fraction of a millimetre; of balls and capsules about as
-    many."""
+    """Vertices (V, 3) of a hull that stands for the piece: its own grown by its radius, a fraction of a millimetre; of
+    balls and capsules some on their surface."""
     if piece.radius == 0.0:
         return piece.vertices
     if not len(piece.planes):

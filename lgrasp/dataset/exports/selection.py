@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lgrasp.dataset.conditions import ALL, OBJECTS_HELD, Condition, not_negative, satisfied
+from lgrasp.dataset.conditions import ALL, OBJECTS_HELD, Condition, satisfied_or_invalid
 from lgrasp.dataset.exports.hand import free_name
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.gather import gather
@@ -203,12 +203,9 @@ def select_rows(
     def look(reader: ShardReader) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, int]:
         """The rows that conditions leave, their ``object_index`` and parts; how many there are, and are negatives."""
         reader.check_whole()
-        rows, index = chosen_rows(reader, where, single=single)
+        rows, index, failing = chosen_rows(reader, where, single=single)
         parts = np.zeros(len(reader), int) if split is None else split.numbers(reader)
-        failing = ~not_negative(reader, where)
-        for condition in where:
-            failing &= condition.holds(reader)
-        return rows, index, parts[rows], len(reader), int(failing.sum())
+        return rows, index, parts[rows], len(reader), failing
 
     for path, _, (rows, index, part, number, failing) in gather(paths, look):
         with ShardReader(path) as reader:
@@ -260,20 +257,22 @@ def select_rows(
 
 def chosen_rows(
     reader: ShardReader, where: Sequence[Condition], *, single: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of a shard that conditions leave, and their ``object_index``.
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The rows of a shard that conditions leave, their ``object_index``, and how many more only metric ``valid`` leaves
+    out.
 
     Raises:
         ShardError: As of :func:`select_rows`.
     """
-    rows = np.flatnonzero(satisfied(reader, where))
+    good, failing = satisfied_or_invalid(reader, where)
+    rows = np.flatnonzero(good)
     index = reader.column("object_index")[rows]
     several = np.flatnonzero((index >= 0).sum(1) != 1)
     if single and len(several):
         count = int((index[several[0]] >= 0).sum())
         hint = f"choose rows with --where '{OBJECTS_HELD} == 1', or --to mjcf"
         raise ShardError(f"{reader.path}: row {rows[several[0]]} holds {count} objects, this format one; {hint}")
-    return rows, index
+    return rows, index, int(failing.sum())
 
 
 def number_columns(reader: ShardReader) -> list[str]:
