@@ -129,7 +129,7 @@ def _way_blocked(
     length = APPROACH_LENGTH / float(_STEPS)
     step = int(first)
     while step < end:
-        by = way * (length * float(step))
+        by = way * (length * float(step + 1))
         clear = sdf_value(obj.sdf, centre + by) - ball[3] - _SURE
         if clear > 0.0:
             step += wp.max(1, int(clear / length))  # it cannot touch before
@@ -197,7 +197,7 @@ def check_way(
     stretches: wp.int32,
     refused_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per (stretch, body, row kept): is the first retreat that is clear so at every place of a stretch?
+    """One thread per (stretch, body, row kept): is the first retreat that is clear so at every step of a stretch?
 
     Args:
         row: (m,) hand of each row, -1 none.
@@ -214,8 +214,7 @@ def check_way(
     way = _way_off(palm, obj, at, s, k)
     T_object = wp.transform_inverse(T)
     B = T_object * _body_pose(hand, b, packed.q_pregrasp, i)
-    places = _STEPS + 1  # the open hand's own first: other links of a finger may come too deep as it opens
-    first, end = stretch * places // stretches, (stretch + 1) * places // stretches
+    first, end = stretch * _STEPS // stretches, (stretch + 1) * _STEPS // stretches
     if _way_blocked(hand, obj, limits, b, B, wp.transform_vector(T_object, way), first, end):
         refused_out[i] = 1
 

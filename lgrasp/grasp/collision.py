@@ -36,23 +36,77 @@ def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: 
     return True
 
 
-@wp.func
-def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
-    """True if all surface samples of the body are farther than ``margin`` [m] from the object. T = T_object_body."""
-    if body_far(hand, obj, body, T, margin):
-        return True
-    for k in range(hand.cluster_first[body], hand.cluster_first[body + 1]):
-        s = hand.cluster_sphere[k]
-        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3] + margin):
-            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                if sdf_below(obj.sdf, wp.transform_point(T, hand.samples[i]), margin):
-                    return False
-    return True
-
-
 def depth_slices(device: str) -> int:
     """In how many slices :func:`body_depth_slice` should come: a GPU has threads for more than there are bodies."""
     return 1 if device == "cpu" else _GPU_DEPTH_SLICES
+
+
+@wp.func
+def _deepest(
+    hand: Hand,
+    obj: Object,
+    body: wp.int32,
+    T: wp.transform,
+    margin: wp.float32,
+    limit: wp.float32,
+    first_run: wp.int32,
+    slices: wp.int32,
+):
+    """Deepest penetration of body and object [m], below 0 how near they come, ``-margin`` when farther apart than
+    ``margin``; stops early above ``limit``. T = T_object_body.
+
+    Both ways: surface samples of the body in the object's distance grid, obstacle points of the object in the body's
+    convex pieces. Balls around runs of points skip what is far. Of these runs every ``slices``-th is looked at, from
+    ``first_run`` on.
+    """
+    depth = -margin
+    b = hand.pieces.body_sphere[body]
+    if b[3] < 0.0:
+        return depth
+    centre = wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))
+    if not sdf_below(obj.sdf, centre, b[3] + margin):
+        return depth
+    for k in range(hand.cluster_first[body] + first_run, hand.cluster_first[body + 1], slices):
+        s = hand.cluster_sphere[k]
+        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3] + margin):
+            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
+                depth = deeper(obj.sdf, wp.transform_point(T, hand.samples[i]), depth)
+            if depth > limit:
+                return depth
+    T_body = wp.transform_inverse(T)
+    first = hand.pieces.body_first[body]
+    end = hand.pieces.body_first[body + 1]
+    for k in range(first_run, obj.clusters, slices):
+        s = obj.cluster_sphere[k]
+        c = wp.vec3(s[0], s[1], s[2])
+        d = c - centre
+        reach = b[3] + s[3] + margin
+        if wp.dot(d, d) < reach * reach:
+            p = wp.transform_point(T_body, c)
+            for piece in range(first, end):
+                grid = hand.piece_grid[piece]
+                if grid >= 0 and piece > first and hand.piece_grid[piece - 1] == grid:
+                    continue  # another piece of a link that is done
+                if grid >= 0:
+                    # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
+                    sdf = sdf_of(hand.contacts.grids, grid)
+                    if sdf_below(sdf, p, s[3] + margin):
+                        for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
+                            depth = deeper(sdf, wp.transform_point(T_body, obj.obstacles[i]), depth)
+                elif point_depth(hand.pieces, piece, p) < s[3] + margin:
+                    for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
+                        q = wp.transform_point(T_body, obj.obstacles[i])
+                        depth = wp.max(depth, -point_depth(hand.pieces, piece, q))
+                if depth > limit:
+                    return depth
+    return depth
+
+
+@wp.func
+def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
+    """True if body and object are farther apart than ``margin`` [m], both ways as :func:`body_depth`.
+    T = T_object_body."""
+    return _deepest(hand, obj, body, T, margin, -margin, 0, 1) <= -margin
 
 
 @wp.func
@@ -65,59 +119,16 @@ def body_depth_slice(
     first_run: wp.int32,
     slices: wp.int32,
 ):
-    """Deepest penetration of body and object [m], 0 when apart; stops early above ``limit``. T = T_object_body.
-
-    Both ways: surface samples of the body in the object's distance grid, obstacle points of the object in the body's
-    convex pieces. Balls around runs of points skip what is far. Of these runs every ``slices``-th is looked at, from
-    ``first_run`` on.
-    """
-    depth = float(0.0)
-    b = hand.pieces.body_sphere[body]
-    if b[3] < 0.0:
-        return depth
-    centre = wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))
-    if not sdf_below(obj.sdf, centre, b[3]):
-        return depth
-    for k in range(hand.cluster_first[body] + first_run, hand.cluster_first[body + 1], slices):
-        s = hand.cluster_sphere[k]
-        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3]):
-            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                depth = deeper(obj.sdf, wp.transform_point(T, hand.samples[i]), depth)
-            if depth > limit:
-                return depth
-    T_body = wp.transform_inverse(T)
-    first = hand.pieces.body_first[body]
-    end = hand.pieces.body_first[body + 1]
-    for k in range(first_run, obj.clusters, slices):
-        s = obj.cluster_sphere[k]
-        c = wp.vec3(s[0], s[1], s[2])
-        d = c - centre
-        reach = b[3] + s[3]
-        if wp.dot(d, d) < reach * reach:
-            p = wp.transform_point(T_body, c)
-            for piece in range(first, end):
-                grid = hand.piece_grid[piece]
-                if grid >= 0 and piece > first and hand.piece_grid[piece - 1] == grid:
-                    continue  # another piece of a link that is done
-                if grid >= 0:
-                    # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
-                    sdf = sdf_of(hand.contacts.grids, grid)
-                    if sdf_below(sdf, p, s[3]):
-                        for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                            depth = deeper(sdf, wp.transform_point(T_body, obj.obstacles[i]), depth)
-                elif point_depth(hand.pieces, piece, p) < s[3]:
-                    for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                        q = wp.transform_point(T_body, obj.obstacles[i])
-                        depth = wp.max(depth, -point_depth(hand.pieces, piece, q))
-                if depth > limit:
-                    return depth
-    return depth
+    """Deepest penetration of body and object [m], 0 when apart, in one of ``slices`` slices of their points; stops
+    early above ``limit``. T = T_object_body."""
+    return _deepest(hand, obj, body, T, 0.0, limit, first_run, slices)
 
 
 @wp.func
 def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: wp.float32):
-    """:func:`body_depth_slice` of the whole."""
-    return body_depth_slice(hand, obj, body, T, limit, 0, 1)
+    """Deepest penetration of body and object [m], 0 when apart: surface samples of the body in the object, obstacle
+    points of the object in the body; stops early above ``limit``. T = T_object_body."""
+    return _deepest(hand, obj, body, T, 0.0, limit, 0, 1)
 
 
 @wp.func

@@ -23,6 +23,7 @@ CHECKS: dict[str, tuple[str, float]] = {
     "mimic": ("mimic_error", bounds.LIMIT_EXCESS),
     "mimic_limits": ("mimic_limit_excess", bounds.LIMIT_EXCESS),
     "penetration": ("penetration_mm", 1e3 * bounds.PENETRATION),
+    "pregrasp": ("pregrasp_mm", 1e3 * bounds.PENETRATION),
     "self_penetration": ("self_penetration_mm", 1e3 * bounds.SELF_PENETRATION),
     "contact_on_object": ("contact_object_mm", 1e3 * bounds.CONTACT_DISTANCE),
     "contact_on_link": ("contact_link_mm", 1e3 * bounds.CONTACT_DISTANCE),
@@ -231,25 +232,37 @@ class RowChecks:
         self._set("self_penetration", 1e3 * depth)
 
     def _penetration(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
-        index, objects, n = self.index[self.good], self.shard.objects, len(self.good)
-        in_link, in_object, between = (np.zeros(n) for _ in range(3))
-        slots = range(index.shape[1])
-        for o, k in itertools.product(slots, range(len(objects))):
+        in_link, in_object = self._hand_in_objects(T_links, T_objects)
+        self.values["object_in_link_mm"][self.good] = 1e3 * in_link
+        self.values["link_in_object_mm"][self.good] = 1e3 * in_object
+        self._set("penetration", 1e3 * np.maximum(in_link, in_object))
+        if "q_pregrasp" in self.g:
+            T_open = self.hand.forward(self._full("q_pregrasp"), len(self.good))
+            self._set("pregrasp", 1e3 * np.max(self._hand_in_objects(T_open, T_objects), axis=0))
+        if T_objects.shape[1] > 1:
+            self._between_objects(T_objects)
+
+    def _hand_in_objects(self, T_links: np.ndarray, T_objects: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Deepest point of any object in a link, and of a link in any object [m], of the good rows."""
+        index = self.index[self.good]
+        in_link, in_object = (np.zeros(len(index)) for _ in range(2))
+        for o, (k, obj) in itertools.product(range(index.shape[1]), enumerate(self.shard.objects)):
             rows = np.flatnonzero(index[:, o] == k)
             if len(rows):
                 T = np.linalg.inv(T_objects[rows, o])[:, None] @ T_links[rows]
-                a, b = hand_in_object(self.hand, objects[k], T)
+                a, b = hand_in_object(self.hand, obj, T)
                 in_link[rows], in_object[rows] = np.maximum(in_link[rows], a), np.maximum(in_object[rows], b)
-        for a, b in itertools.combinations(slots, 2):
+        return in_link, in_object
+
+    def _between_objects(self, T_objects: np.ndarray) -> None:
+        index, between = self.index[self.good], np.zeros(len(self.good))
+        objects = self.shard.objects
+        for a, b in itertools.combinations(range(index.shape[1]), 2):
             for i in np.flatnonzero((index[:, a] >= 0) & (index[:, b] >= 0)):
                 T = (np.linalg.inv(T_objects[i, a]) @ T_objects[i, b])[None]
                 depth = object_in_object(objects[index[i, a]], objects[index[i, b]], T)
                 between[i] = max(between[i], depth[0])
-        self.values["object_in_link_mm"][self.good] = 1e3 * in_link
-        self.values["link_in_object_mm"][self.good] = 1e3 * in_object
-        self._set("penetration", 1e3 * np.maximum(in_link, in_object))
-        if len(slots) > 1:
-            self._set("object_object", 1e3 * between)
+        self._set("object_object", 1e3 * between)
 
     def _contacts(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
         """Contact distances and normals; keeps the recomputed outward object normals for the wrenches, and the links'

@@ -13,7 +13,7 @@ from lgrasp.refine.volume import upload_target
 from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
 
-VERSION = 7
+VERSION = 8
 
 
 def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
