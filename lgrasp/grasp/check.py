@@ -37,6 +37,7 @@ from lgrasp.grasp.outcomes import LATE, MEASURED, METRICS, REASONS, SHARED, Outc
 from lgrasp.grasp.pregrasp_kernels import (
     FINGER_TRIES,
     OPENING_SHARES,
+    check_openings,
     find_distances_off,
     measure_closing,
     open_fingers,
@@ -204,6 +205,8 @@ class Check:
         wp.launch(find_distances_off, (self.bodies - 1, m), [hand, obj, limits, places, at, row], [off], device=d)
         inputs = [hand, obj, self.held.struct, limits, at, opened, row, off]
         wp.launch(try_openings, (OPENING_SHARES, m), inputs, [tried], device=d)
+        opening = [hand, obj, self.held.struct, at, opened, row, off]
+        wp.launch(check_openings, (self.bodies - 1, m), opening, [tried], device=d)
         wp.launch(open_poses, m, [hand, at, opened, row, tried], [packed, stuck], device=d)
         clear = wp.zeros((m, model.groups), dtype=wp.int32, device=d)
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)

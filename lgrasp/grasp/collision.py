@@ -36,6 +36,20 @@ def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: 
     return True
 
 
+@wp.func
+def samples_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
+    """Fast test: all surface samples of the body are farther than ``margin`` [m] from the object. T = T_object_body."""
+    if body_far(hand, obj, body, T, margin):
+        return True
+    for k in range(hand.cluster_first[body], hand.cluster_first[body + 1]):
+        s = hand.cluster_sphere[k]
+        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3] + margin):
+            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
+                if sdf_below(obj.sdf, wp.transform_point(T, hand.samples[i]), margin):
+                    return False
+    return True
+
+
 def depth_slices(device: str) -> int:
     """In how many slices :func:`body_depth_slice` should come: a GPU has threads for more than there are bodies."""
     return 1 if device == "cpu" else _GPU_DEPTH_SLICES

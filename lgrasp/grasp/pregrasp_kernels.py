@@ -5,8 +5,8 @@ import warp as wp
 from lgrasp.grasp.bounds import ANY_PENETRATION
 from lgrasp.grasp.check_kernels import hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Limits, Packed, Places
-from lgrasp.grasp.collision import body_apart, body_depth, body_height, resting_plane
-from lgrasp.grasp.held import Held, body_clear_of_held
+from lgrasp.grasp.collision import body_apart, body_depth, body_height, resting_plane, samples_apart
+from lgrasp.grasp.held import Held, body_clear_of_held, body_depth_in_held
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward, vec_dof
 from lgrasp.math.limits import MAX_BODIES
@@ -27,12 +27,10 @@ _NEAR = wp.constant(0.002)  # [m] bodies whose samples are farther from the obje
 
 
 @wp.func
-def distance_off(hand: Hand, obj: Object, limits: Limits, body: wp.int32, T: wp.transform):
-    """How far a body without a contact must be off the object as the hand opens [m]: where the object rests on it at
-    the grasp it may stay, as deep (below 0) as at a grasp. T = T_object_body at the grasp."""
-    if body_apart(hand, obj, body, T, limits.min_pregrasp_distance):
-        return limits.min_pregrasp_distance
-    return -limits.max_penetration
+def distance_off(limits: Limits, apart: wp.bool):
+    """How far a body without a contact must be off the object as the hand opens [m]: where it is not that far apart at
+    the grasp it may stay, as deep (below 0) as at a grasp."""
+    return wp.where(apart, limits.min_pregrasp_distance, -limits.max_penetration)
 
 
 @wp.kernel
@@ -59,7 +57,8 @@ def find_distances_off(
     for c in range(at.contact.shape[1]):
         if at.contact[s, c] >= 0 and places.body[at.contact[s, c]] == 1 + j:
             return
-    off_out[i, j] = distance_off(hand, obj, limits, 1 + j, wp.transform_inverse(at.pose[at.of[s]]) * at.body[s, j])
+    T = wp.transform_inverse(at.pose[at.of[s]]) * at.body[s, j]
+    off_out[i, j] = distance_off(limits, body_apart(hand, obj, 1 + j, T, limits.min_pregrasp_distance))
 
 
 @wp.func
@@ -75,7 +74,7 @@ def finger_clear(
     X: wp.array(dtype=wp.transform),
     off: wp.array(dtype=wp.float32),
 ):
-    """1 if the bodies of a finger are off the object at T, its table and what is held.
+    """Fast test, 1 if the bodies of a finger are off the object at T, its table and what is held, by their samples.
 
     Args:
         X: (bodies - 1,) X[j] = pose of body 1 + j.
@@ -85,13 +84,33 @@ def finger_clear(
     plane = resting_plane(obj, T, pose)
     above = limits.min_table_distance
     for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-        if not body_apart(hand, obj, 1 + k, T_object * X[k], off[k]):
+        if not samples_apart(hand, obj, 1 + k, T_object * X[k], off[k]):
             return 0
         if body_height(hand.pieces, 1 + k, X[k], plane, above) < above:
             return 0
         if not body_clear_of_held(hand, held, h, 1 + k, X[k], limits.min_self_distance):
             return 0
     return 1
+
+
+@wp.func
+def _body_off(
+    hand: Hand,
+    obj: Object,
+    held: Held,
+    h: wp.int32,
+    body: wp.int32,
+    T_object: wp.transform,
+    X: wp.transform,
+    off: wp.float32,
+):
+    """True if a body is off the object, and not in what is held, by samples of either.
+
+    Args:
+        T_object: T_object_hand. X: pose of the body in the hand frame.
+        off: how far it must be off the object [m].
+    """
+    return body_apart(hand, obj, body, T_object * X, off) and body_depth_in_held(hand, held, h, body, X, 0.0) <= 0.0
 
 
 @wp.func
@@ -162,6 +181,52 @@ def try_openings(
 
 
 @wp.func
+def _first_try(clear: wp.int32):
+    """The lowest bit that is set; there is one."""
+    t = int(0)
+    while (clear >> t) & 1 == 0:
+        t += 1
+    return t
+
+
+@wp.kernel
+def check_openings(
+    hand: Hand,
+    obj: Object,
+    held: Held,
+    at: CheckedPostures,
+    opened: wp.array3d(dtype=vec_dof),
+    row: wp.array(dtype=wp.int32),
+    off: wp.array2d(dtype=wp.float32),
+    clear_out: wp.array(dtype=wp.int32),
+):
+    """One thread per (body, row): is a body of a touching finger off what it must be, by all points, as far open as the
+    first try that is clear? No try is where one is not.
+
+    Args:
+        opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
+        row: (m,) hand of each row, -1 none.
+        off: (m, bodies - 1) of :func:`find_distances_off` [m].
+        clear_out: (m,) of :func:`try_openings`.
+    """
+    j, i = wp.tid()
+    s = row[i]
+    if s < 0:
+        return
+    g = hand.body_group[1 + j]
+    clear = clear_out[i]
+    if clear == 0 or g < 0 or at.chosen[s, wp.max(g, 0)] < 0:
+        return
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    group_forward(
+        hand.kin, g, _opened_share(at.posture[s, g], opened[i, g, 0], _first_try(clear)), X, hand.kin.joint_first[g]
+    )
+    h = at.index[at.of[s]] // held.tries
+    if not _body_off(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[at.of[s]]), X[j], off[i, j]):
+        clear_out[i] = 0
+
+
+@wp.func
 def put_opening(i: wp.int32, least: wp.float32, most: wp.float32, packed_out: Packed):
     """How far touching fingers are opened at least, 0 without any, and any finger at most [rad or m]."""
     packed_out.closing_travel[i] = most
@@ -193,9 +258,7 @@ def open_poses(
     if clear[i] == 0:
         stuck_out[1 + wp.atomic_add(stuck_out, 0, 1)] = i
         return
-    t = int(0)
-    while (clear[i] >> t) & 1 == 0:
-        t += 1
+    t = _first_try(clear[i])
     least = float(_NOT_TOUCHING)
     most = float(0.0)
     for g in range(hand.kin.groups):
@@ -243,7 +306,7 @@ def try_fingers(
     stuck: wp.array(dtype=wp.int32),
     clear_out: wp.array2d(dtype=wp.int32),
 ):
-    """One thread per (row listed, group, try): is the finger off the object and what is held?
+    """One thread per (row listed, group, try): is the finger off the object and what is held, by all points?
 
     Args:
         opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
@@ -264,8 +327,12 @@ def try_fingers(
     x = opened_finger(hand, held, h, g, t, at.posture[s, g], opened[i, g, 0], opened[i, g, 1])
     group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
     r = at.of[s]
-    if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, off[i]) == 1:
-        wp.atomic_or(clear_out, k, g, 1 << t)
+    if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, off[i]) == 0:
+        return
+    for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
+        if not _body_off(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[r]), X[j], off[i, j]):
+            return
+    wp.atomic_or(clear_out, k, g, 1 << t)
 
 
 @wp.kernel
@@ -369,7 +436,7 @@ def measure_closing(
             before[j] = X[j]
             inside[j] = 0
             T = T_object * X[j]
-            if part < _PARTS and not body_apart(hand, obj, 1 + j, T, wp.where(off[i, j] < 0.0, off[i, j], _NEAR)):
+            if part < _PARTS and not samples_apart(hand, obj, 1 + j, T, wp.where(off[i, j] < 0.0, off[i, j], _NEAR)):
                 last = part == _PARTS - 1
                 depth = body_depth(hand, obj, 1 + j, T, wp.where(last, _DEEPEST, _INSIDE))
                 if last:
