@@ -51,7 +51,7 @@ def samples_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, marg
 
 
 def depth_slices(device: str) -> int:
-    """In how many slices :func:`body_depth_slice` should come: a GPU has threads for more than there are bodies."""
+    """In how many slices the points of body and object should come: a GPU has threads for more than all bodies."""
     return 1 if device == "cpu" else _GPU_DEPTH_SLICES
 
 
@@ -117,10 +117,18 @@ def _deepest(
 
 
 @wp.func
-def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
-    """True if body and object are farther apart than ``margin`` [m], both ways as :func:`body_depth`.
-    T = T_object_body."""
-    return _deepest(hand, obj, body, T, margin, -margin, 0, 1) <= -margin
+def slice_apart(
+    hand: Hand,
+    obj: Object,
+    body: wp.int32,
+    T: wp.transform,
+    margin: wp.float32,
+    first_run: wp.int32,
+    slices: wp.int32,
+):
+    """True if body and object are farther apart than ``margin`` [m], both ways, in one of ``slices`` slices of their
+    points. T = T_object_body."""
+    return _deepest(hand, obj, body, T, margin, -margin, first_run, slices) <= -margin
 
 
 @wp.func

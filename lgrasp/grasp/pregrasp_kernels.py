@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.grasp.bounds import ANY_PENETRATION
 from lgrasp.grasp.check_kernels import hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Limits, Packed, Places
-from lgrasp.grasp.collision import body_apart, body_depth, body_height, resting_plane, samples_apart
+from lgrasp.grasp.collision import body_depth, body_height, resting_plane, samples_apart, slice_apart
 from lgrasp.grasp.held import Held, body_clear_of_held, body_depth_in_held
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward, vec_dof
@@ -41,24 +41,27 @@ def find_distances_off(
     places: Places,
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
+    slices: wp.int32,
     off_out: wp.array2d(dtype=wp.float32),
 ):
-    """How far each body must be off the object as the hand opens (:func:`distance_off`), one thread per (body, row).
+    """How far each body must be off the object as the hand opens (:func:`distance_off`), one thread per (slice, body,
+    row).
 
     Args:
         row: (m,) hand of each row, -1 none.
-        off_out: (m, bodies - 1) of all but the base [m].
+        slices: of the points (:func:`~lgrasp.grasp.collision.depth_slices`).
+        off_out: (m, bodies - 1) of all but the base [m]; on entry that of bodies that are apart.
     """
-    j, i = wp.tid()
+    k, j, i = wp.tid()
     s = row[i]
     if s < 0:
         return
-    off_out[i, j] = limits.min_pregrasp_distance
     for c in range(at.contact.shape[1]):
         if at.contact[s, c] >= 0 and places.body[at.contact[s, c]] == 1 + j:
             return
     T = wp.transform_inverse(at.pose[at.of[s]]) * at.body[s, j]
-    off_out[i, j] = distance_off(limits, body_apart(hand, obj, 1 + j, T, limits.min_pregrasp_distance))
+    if not slice_apart(hand, obj, 1 + j, T, limits.min_pregrasp_distance, k, slices):
+        off_out[i, j] = distance_off(limits, False)
 
 
 @wp.func
@@ -103,14 +106,18 @@ def _body_off(
     T_object: wp.transform,
     X: wp.transform,
     off: wp.float32,
+    k: wp.int32,
+    slices: wp.int32,
 ):
-    """True if a body is off the object, and not in what is held, by samples of either.
+    """True if a body is off the object by slice k of the points of either, and for slice 0 not in what is held.
 
     Args:
         T_object: T_object_hand. X: pose of the body in the hand frame.
         off: how far it must be off the object [m].
     """
-    return body_apart(hand, obj, body, T_object * X, off) and body_depth_in_held(hand, held, h, body, X, 0.0) <= 0.0
+    if k == 0 and body_depth_in_held(hand, held, h, body, X, 0.0) > 0.0:
+        return False
+    return slice_apart(hand, obj, body, T_object * X, off, k, slices)
 
 
 @wp.func
@@ -198,18 +205,20 @@ def check_openings(
     opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
     off: wp.array2d(dtype=wp.float32),
+    slices: wp.int32,
     clear_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per (body, row): is a body of a touching finger off what it must be, by all points, as far open as the
-    first try that is clear? No try is where one is not.
+    """One thread per (slice, body, row): is a body of a touching finger off the objects by all points, as far open as
+    the first try that is clear? No try is where one is not.
 
     Args:
         opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
         row: (m,) hand of each row, -1 none.
         off: (m, bodies - 1) of :func:`find_distances_off` [m].
+        slices: of the points (:func:`~lgrasp.grasp.collision.depth_slices`).
         clear_out: (m,) of :func:`try_openings`.
     """
-    j, i = wp.tid()
+    k, j, i = wp.tid()
     s = row[i]
     if s < 0:
         return
@@ -222,7 +231,8 @@ def check_openings(
         hand.kin, g, _opened_share(at.posture[s, g], opened[i, g, 0], _first_try(clear)), X, hand.kin.joint_first[g]
     )
     h = at.index[at.of[s]] // held.tries
-    if not _body_off(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[at.of[s]]), X[j], off[i, j]):
+    T_object = wp.transform_inverse(at.pose[at.of[s]])
+    if not _body_off(hand, obj, held, h, 1 + j, T_object, X[j], off[i, j], k, slices):
         clear_out[i] = 0
 
 
@@ -330,7 +340,7 @@ def try_fingers(
     if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, off[i]) == 0:
         return
     for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-        if not _body_off(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[r]), X[j], off[i, j]):
+        if not _body_off(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[r]), X[j], off[i, j], 0, 1):
             return
     wp.atomic_or(clear_out, k, g, 1 << t)
 
