@@ -201,14 +201,13 @@ class Check:
         wp.launch(find_stable_squeeze, m, inputs, [packed], device=d)
         wp.launch(limit_squeeze, m, [hand, limits, row], [packed], device=d)
         tried, stuck = wp.zeros(m, dtype=wp.int32, device=d), wp.zeros(1 + m, dtype=wp.int32, device=d)
-        slices, others = depth_slices(d), self.bodies - 1
-        off = wp.full((m, others), limits.min_pregrasp_distance, dtype=wp.float32, device=d)
-        inputs = [hand, obj, limits, places, at, row, slices]
-        wp.launch(find_distances_off, (slices, others, m), inputs, [off], device=d)
+        off = wp.empty((m, self.bodies - 1), dtype=wp.float32, device=d)
+        wp.launch(find_distances_off, (self.bodies - 1, m), [hand, obj, limits, places, at, row], [off], device=d)
         inputs = [hand, obj, self.held.struct, limits, at, opened, row, off]
         wp.launch(try_openings, (OPENING_SHARES, m), inputs, [tried], device=d)
+        slices = depth_slices(d)
         opening = [hand, obj, self.held.struct, at, opened, row, off, slices]
-        wp.launch(check_openings, (slices, others, m), opening, [tried], device=d)
+        wp.launch(check_openings, (slices, self.bodies - 1, m), opening, [tried], device=d)
         wp.launch(open_poses, m, [hand, at, opened, row, tried], [packed, stuck], device=d)
         clear = wp.zeros((m, model.groups), dtype=wp.int32, device=d)
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)

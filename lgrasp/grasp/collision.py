@@ -37,8 +37,8 @@ def body_clear(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, slack: 
 
 
 @wp.func
-def samples_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
-    """Fast test: all surface samples of the body are farther than ``margin`` [m] from the object. T = T_object_body."""
+def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin: wp.float32):
+    """True if all surface samples of the body are farther than ``margin`` [m] from the object. T = T_object_body."""
     if body_far(hand, obj, body, T, margin):
         return True
     for k in range(hand.cluster_first[body], hand.cluster_first[body + 1]):
@@ -56,33 +56,31 @@ def depth_slices(device: str) -> int:
 
 
 @wp.func
-def _deepest(
+def body_depth_slice(
     hand: Hand,
     obj: Object,
     body: wp.int32,
     T: wp.transform,
-    margin: wp.float32,
     limit: wp.float32,
     first_run: wp.int32,
     slices: wp.int32,
 ):
-    """Deepest penetration of body and object [m], below 0 how near they come, ``-margin`` when farther apart than
-    ``margin``; stops early above ``limit``. T = T_object_body.
+    """Deepest penetration of body and object [m], 0 when apart; stops early above ``limit``. T = T_object_body.
 
     Both ways: surface samples of the body in the object's distance grid, obstacle points of the object in the body's
     convex pieces. Balls around runs of points skip what is far. Of these runs every ``slices``-th is looked at, from
     ``first_run`` on.
     """
-    depth = -margin
+    depth = float(0.0)
     b = hand.pieces.body_sphere[body]
     if b[3] < 0.0:
         return depth
     centre = wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))
-    if not sdf_below(obj.sdf, centre, b[3] + margin):
+    if not sdf_below(obj.sdf, centre, b[3]):
         return depth
     for k in range(hand.cluster_first[body] + first_run, hand.cluster_first[body + 1], slices):
         s = hand.cluster_sphere[k]
-        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3] + margin):
+        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3]):
             for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                 depth = deeper(obj.sdf, wp.transform_point(T, hand.samples[i]), depth)
             if depth > limit:
@@ -94,7 +92,7 @@ def _deepest(
         s = obj.cluster_sphere[k]
         c = wp.vec3(s[0], s[1], s[2])
         d = c - centre
-        reach = b[3] + s[3] + margin
+        reach = b[3] + s[3]
         if wp.dot(d, d) < reach * reach:
             p = wp.transform_point(T_body, c)
             for piece in range(first, end):
@@ -104,10 +102,10 @@ def _deepest(
                 if grid >= 0:
                     # a lookup in the link's distance grid is cheaper than a hull's planes, and true to its shape
                     sdf = sdf_of(hand.contacts.grids, grid)
-                    if sdf_below(sdf, p, s[3] + margin):
+                    if sdf_below(sdf, p, s[3]):
                         for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                             depth = deeper(sdf, wp.transform_point(T_body, obj.obstacles[i]), depth)
-                elif point_depth(hand.pieces, piece, p) < s[3] + margin:
+                elif point_depth(hand.pieces, piece, p) < s[3]:
                     for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
                         q = wp.transform_point(T_body, obj.obstacles[i])
                         depth = wp.max(depth, -point_depth(hand.pieces, piece, q))
@@ -117,40 +115,9 @@ def _deepest(
 
 
 @wp.func
-def slice_apart(
-    hand: Hand,
-    obj: Object,
-    body: wp.int32,
-    T: wp.transform,
-    margin: wp.float32,
-    first_run: wp.int32,
-    slices: wp.int32,
-):
-    """True if body and object are farther apart than ``margin`` [m], both ways, in one of ``slices`` slices of their
-    points. T = T_object_body."""
-    return _deepest(hand, obj, body, T, margin, -margin, first_run, slices) <= -margin
-
-
-@wp.func
-def body_depth_slice(
-    hand: Hand,
-    obj: Object,
-    body: wp.int32,
-    T: wp.transform,
-    limit: wp.float32,
-    first_run: wp.int32,
-    slices: wp.int32,
-):
-    """Deepest penetration of body and object [m], 0 when apart, in one of ``slices`` slices of their points; stops
-    early above ``limit``. T = T_object_body."""
-    return _deepest(hand, obj, body, T, 0.0, limit, first_run, slices)
-
-
-@wp.func
 def body_depth(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, limit: wp.float32):
-    """Deepest penetration of body and object [m], 0 when apart: surface samples of the body in the object, obstacle
-    points of the object in the body; stops early above ``limit``. T = T_object_body."""
-    return _deepest(hand, obj, body, T, 0.0, limit, 0, 1)
+    """:func:`body_depth_slice` of the whole."""
+    return body_depth_slice(hand, obj, body, T, limit, 0, 1)
 
 
 @wp.func

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from lgrasp.grasp.collision import body_depth, samples_apart
+from lgrasp.grasp.collision import body_apart, body_depth
 from lgrasp.hand.arrays import Hand, HandArrays
 from lgrasp.math.kinematics import vec_dof
 from lgrasp.math.limits import MAX_DOFS
@@ -127,7 +127,7 @@ def with_frozen(hand: Hand, held: Held, row: wp.int32, g: wp.int32, q: vec_dof):
 def body_clear_of_held(hand: Hand, held: Held, row: wp.int32, body: wp.int32, B: wp.transform, margin: wp.float32):
     """Whether all surface samples of a body are farther than ``margin`` [m] from all held objects. B = T_hand_body."""
     for k in range(held.objects):
-        if not samples_apart(hand, held.object[k], body, wp.transform_inverse(held.pose[row, k]) * B, margin):
+        if not body_apart(hand, held.object[k], body, wp.transform_inverse(held.pose[row, k]) * B, margin):
             return False
     return True
 

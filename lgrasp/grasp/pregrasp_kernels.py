@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.grasp.bounds import ANY_PENETRATION
 from lgrasp.grasp.check_kernels import hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Limits, Packed, Places
-from lgrasp.grasp.collision import body_depth, body_height, resting_plane, samples_apart, slice_apart
+from lgrasp.grasp.collision import body_apart, body_depth, body_depth_slice, body_height, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held, body_depth_in_held
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward, vec_dof
@@ -27,10 +27,12 @@ _NEAR = wp.constant(0.002)  # [m] bodies whose samples are farther from the obje
 
 
 @wp.func
-def distance_off(limits: Limits, apart: wp.bool):
-    """How far a body without a contact must be off the object as the hand opens [m]: where it is not that far apart at
-    the grasp it may stay, as deep (below 0) as at a grasp."""
-    return wp.where(apart, limits.min_pregrasp_distance, -limits.max_penetration)
+def distance_off(hand: Hand, obj: Object, limits: Limits, body: wp.int32, T: wp.transform):
+    """How far a body without a contact must be off the object as the hand opens [m]: where the object rests on it at
+    the grasp it may stay, as deep (below 0) as at a grasp. T = T_object_body at the grasp."""
+    if body_apart(hand, obj, body, T, limits.min_pregrasp_distance):
+        return limits.min_pregrasp_distance
+    return -limits.max_penetration
 
 
 @wp.kernel
@@ -41,27 +43,23 @@ def find_distances_off(
     places: Places,
     at: CheckedPostures,
     row: wp.array(dtype=wp.int32),
-    slices: wp.int32,
     off_out: wp.array2d(dtype=wp.float32),
 ):
-    """How far each body must be off the object as the hand opens (:func:`distance_off`), one thread per (slice, body,
-    row).
+    """How far each body must be off the object as the hand opens (:func:`distance_off`), one thread per (body, row).
 
     Args:
         row: (m,) hand of each row, -1 none.
-        slices: of the points (:func:`~lgrasp.grasp.collision.depth_slices`).
-        off_out: (m, bodies - 1) of all but the base [m]; on entry that of bodies that are apart.
+        off_out: (m, bodies - 1) of all but the base [m].
     """
-    k, j, i = wp.tid()
+    j, i = wp.tid()
     s = row[i]
     if s < 0:
         return
+    off_out[i, j] = limits.min_pregrasp_distance
     for c in range(at.contact.shape[1]):
         if at.contact[s, c] >= 0 and places.body[at.contact[s, c]] == 1 + j:
             return
-    T = wp.transform_inverse(at.pose[at.of[s]]) * at.body[s, j]
-    if not slice_apart(hand, obj, 1 + j, T, limits.min_pregrasp_distance, k, slices):
-        off_out[i, j] = distance_off(limits, False)
+    off_out[i, j] = distance_off(hand, obj, limits, 1 + j, wp.transform_inverse(at.pose[at.of[s]]) * at.body[s, j])
 
 
 @wp.func
@@ -77,7 +75,7 @@ def finger_clear(
     X: wp.array(dtype=wp.transform),
     off: wp.array(dtype=wp.float32),
 ):
-    """Fast test, 1 if the bodies of a finger are off the object at T, its table and what is held, by their samples.
+    """1 if the bodies of a finger are off the object at T, its table and what is held, by their samples.
 
     Args:
         X: (bodies - 1,) X[j] = pose of body 1 + j.
@@ -87,37 +85,13 @@ def finger_clear(
     plane = resting_plane(obj, T, pose)
     above = limits.min_table_distance
     for k in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-        if not samples_apart(hand, obj, 1 + k, T_object * X[k], off[k]):
+        if not body_apart(hand, obj, 1 + k, T_object * X[k], off[k]):
             return 0
         if body_height(hand.pieces, 1 + k, X[k], plane, above) < above:
             return 0
         if not body_clear_of_held(hand, held, h, 1 + k, X[k], limits.min_self_distance):
             return 0
     return 1
-
-
-@wp.func
-def _body_off(
-    hand: Hand,
-    obj: Object,
-    held: Held,
-    h: wp.int32,
-    body: wp.int32,
-    T_object: wp.transform,
-    X: wp.transform,
-    off: wp.float32,
-    k: wp.int32,
-    slices: wp.int32,
-):
-    """True if a body is off the object by slice k of the points of either, and for slice 0 not in what is held.
-
-    Args:
-        T_object: T_object_hand. X: pose of the body in the hand frame.
-        off: how far it must be off the object [m].
-    """
-    if k == 0 and body_depth_in_held(hand, held, h, body, X, 0.0) > 0.0:
-        return False
-    return slice_apart(hand, obj, body, T_object * X, off, k, slices)
 
 
 @wp.func
@@ -196,6 +170,31 @@ def _first_try(clear: wp.int32):
     return t
 
 
+@wp.func
+def _sinks(
+    hand: Hand,
+    obj: Object,
+    held: Held,
+    h: wp.int32,
+    body: wp.int32,
+    T_object: wp.transform,
+    X: wp.transform,
+    off: wp.float32,
+    k: wp.int32,
+    slices: wp.int32,
+):
+    """True if a body is in what is held, or by slice k of the points of either deeper in the object than it may.
+
+    Args:
+        T_object: T_object_hand. X: pose of the body in the hand frame.
+        off: how far it must be off the object [m]; below 0 it may be that deep.
+    """
+    if k == 0 and body_depth_in_held(hand, held, h, body, X, 0.0) > 0.0:
+        return True
+    limit = wp.max(0.0, -off)
+    return body_depth_slice(hand, obj, body, T_object * X, limit, k, slices) > limit
+
+
 @wp.kernel
 def check_openings(
     hand: Hand,
@@ -208,8 +207,8 @@ def check_openings(
     slices: wp.int32,
     clear_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per (slice, body, row): is a body of a touching finger off the objects by all points, as far open as
-    the first try that is clear? No try is where one is not.
+    """One thread per (slice, body, row): is a body of a touching finger out of the objects by all points, as far open
+    as the first try that is clear by samples? No try is where one is not.
 
     Args:
         opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
@@ -227,12 +226,11 @@ def check_openings(
     if clear == 0 or g < 0 or at.chosen[s, wp.max(g, 0)] < 0:
         return
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    group_forward(
-        hand.kin, g, _opened_share(at.posture[s, g], opened[i, g, 0], _first_try(clear)), X, hand.kin.joint_first[g]
-    )
+    x = _opened_share(at.posture[s, g], opened[i, g, 0], _first_try(clear))
+    group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
     h = at.index[at.of[s]] // held.tries
     T_object = wp.transform_inverse(at.pose[at.of[s]])
-    if not _body_off(hand, obj, held, h, 1 + j, T_object, X[j], off[i, j], k, slices):
+    if _sinks(hand, obj, held, h, 1 + j, T_object, X[j], off[i, j], k, slices):
         clear_out[i] = 0
 
 
@@ -340,7 +338,7 @@ def try_fingers(
     if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, off[i]) == 0:
         return
     for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-        if not _body_off(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[r]), X[j], off[i, j], 0, 1):
+        if _sinks(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[r]), X[j], off[i, j], 0, 1):
             return
     wp.atomic_or(clear_out, k, g, 1 << t)
 
@@ -446,7 +444,7 @@ def measure_closing(
             before[j] = X[j]
             inside[j] = 0
             T = T_object * X[j]
-            if part < _PARTS and not samples_apart(hand, obj, 1 + j, T, wp.where(off[i, j] < 0.0, off[i, j], _NEAR)):
+            if part < _PARTS and not body_apart(hand, obj, 1 + j, T, wp.where(off[i, j] < 0.0, off[i, j], _NEAR)):
                 last = part == _PARTS - 1
                 depth = body_depth(hand, obj, 1 + j, T, wp.where(last, _DEEPEST, _INSIDE))
                 if last:

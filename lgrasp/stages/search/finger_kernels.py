@@ -4,7 +4,7 @@ import warp as wp
 
 from lgrasp.field.arrays import Field
 from lgrasp.grasp.check_structs import Limits
-from lgrasp.grasp.collision import body_depth_slice, samples_apart
+from lgrasp.grasp.collision import body_depth_slice
 from lgrasp.grasp.control_kernels import back_off, shift_contact
 from lgrasp.grasp.held import Held
 from lgrasp.grasp.pregrasp_kernels import FINGER_TRIES, distance_off, finger_clear, joint_motion, opened_finger
@@ -188,8 +188,7 @@ def _opens(
     for k in range(first, hand.kin.joint_first[g + 1]):
         off[k] = limits.min_pregrasp_distance
         if (touching >> (k - first)) & 1 == 0:
-            T = wp.transform_inverse(pose) * X_grasp[k]
-            off[k] = distance_off(limits, samples_apart(hand, obj, 1 + k, T, limits.min_pregrasp_distance))
+            off[k] = distance_off(hand, obj, limits, 1 + k, wp.transform_inverse(pose) * X_grasp[k])
     for t in range(FINGER_TRIES):
         x = opened_finger(hand, held, h, g, t, q, opened, freed)
         moved = joint_motion(hand, g, x, q)

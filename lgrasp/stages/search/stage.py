@@ -44,7 +44,7 @@ from lgrasp.stages.search.params import SearchParams
 from lgrasp.stages.search.sets import AskedCandidates, FoundSets, Hits, SearchValues, TriedSets, Usable, vec_kinds
 from lgrasp.stages.search.swap_kernels import swap_contacts
 
-VERSION = 16
+VERSION = 15
 
 _CPU_STARTS = 2  # of a pose in one launch
 _GPU_STARTS = 10  # and on every device where what is left out of later starts depends on it
