@@ -94,7 +94,7 @@ class HoldTester:
                 were not tried as lost, and those lost in the first trial are not drawn at all.
         """
         n, draws = len(postures), self._test.draws
-        grasps = self._put(postures)
+        grasps = upload_struct(TriedGrasps, self._device, vars(postures) | {"number": _fold(postures.number)})
         held, drift = self._try(grasps, np.arange(n), self._sown(_nominal(), seed), np.zeros(n, int))
         hits = np.zeros(n)
         active = np.flatnonzero(held) if least > 0.0 else np.arange(n)
@@ -112,19 +112,6 @@ class HoldTester:
             "hold_probability": probability.astype(np.float32),
             "hold_drift": np.where(held, drift, np.inf).astype(np.float32),
         }
-
-    def _put(self, postures: ControlPoses) -> Any:
-        return upload_struct(
-            TriedGrasps,
-            self._device,
-            {
-                "pregrasp": np.asarray(postures.pregrasp, np.float32),
-                "grasp": np.asarray(postures.grasp, np.float32),
-                "squeeze": np.asarray(postures.squeeze, np.float32),
-                "pose": np.asarray(postures.pose, np.float32),
-                "number": _fold(postures.number),
-            },
-        )
 
     def _sown(self, spread: Any, seed: int) -> Any:
         """Ranges with a seed, and strata for all draws: of each number they have one in each of as many equal parts of

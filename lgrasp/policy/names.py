@@ -1,6 +1,5 @@
 """Where pose policies are: beside the rules of hands, or files of users; light to import."""
 
-import hashlib
 from pathlib import Path
 
 from lgrasp.errors import ConfigError
@@ -38,12 +37,3 @@ def policy_file(path: str | Path) -> bytes:
     if len(data) > _MOST_BYTES:
         raise ConfigError(f"place.policy: {path} is larger than {_MOST_BYTES:,} bytes, so it is no pose policy")
     return data
-
-
-def policy_digest(path: str | Path) -> str:
-    """SHA-256 of the file of a policy.
-
-    Raises:
-        ConfigError: see :func:`policy_file`.
-    """
-    return hashlib.sha256(policy_file(path)).hexdigest()

@@ -1,11 +1,12 @@
 """Parameters of the place stage."""
 
+import hashlib
 from typing import ClassVar
 
 from pydantic import Field, field_serializer
 
 from lgrasp.config import Params
-from lgrasp.policy.names import SHIPPED, policy_digest
+from lgrasp.policy.names import SHIPPED, policy_file
 
 NO_BOUND = 10.0
 """[m] farther from the centre of mass than any line between two contacts."""
@@ -79,7 +80,7 @@ class PlaceParams(Params):
 
     @field_serializer("policy", when_used="json")
     def _by_content(self, value: str | None) -> str | None:
-        return value if value in (None, SHIPPED) else policy_digest(value)
+        return value if value in (None, SHIPPED) else hashlib.sha256(policy_file(value)).hexdigest()
 
     @property
     def weights(self) -> dict[str, float]:
