@@ -205,9 +205,8 @@ class Check:
         wp.launch(find_distances_off, (self.bodies - 1, m), [hand, obj, limits, places, at, row], [off], device=d)
         inputs = [hand, obj, self.held.struct, limits, at, opened, row, off]
         wp.launch(try_openings, (OPENING_SHARES, m), inputs, [tried], device=d)
-        slices = depth_slices(d)
-        opening = [hand, obj, self.held.struct, at, opened, row, off, slices]
-        wp.launch(check_openings, (slices, self.bodies - 1, m), opening, [tried], device=d)
+        opening = [hand, obj, self.held.struct, at, opened, row, off]
+        wp.launch(check_openings, (self.bodies - 1, m), opening, [tried], device=d)
         wp.launch(open_poses, m, [hand, at, opened, row, tried], [packed, stuck], device=d)
         clear = wp.zeros((m, model.groups), dtype=wp.int32, device=d)
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)

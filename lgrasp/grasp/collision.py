@@ -51,12 +51,12 @@ def body_apart(hand: Hand, obj: Object, body: wp.int32, T: wp.transform, margin:
 
 
 def depth_slices(device: str) -> int:
-    """In how many slices the points of body and object should come: a GPU has threads for more than all bodies."""
+    """In how many slices :func:`body_depth_slice` should come: a GPU has threads for more than there are bodies."""
     return 1 if device == "cpu" else _GPU_DEPTH_SLICES
 
 
 @wp.func
-def body_depth_slice(
+def obstacles_depth(
     hand: Hand,
     obj: Object,
     body: wp.int32,
@@ -65,26 +65,14 @@ def body_depth_slice(
     first_run: wp.int32,
     slices: wp.int32,
 ):
-    """Deepest penetration of body and object [m], 0 when apart; stops early above ``limit``. T = T_object_body.
+    """Deepest obstacle point of the object in a body that has pieces [m], 0 when none is; stops early above ``limit``.
+    T = T_object_body.
 
-    Both ways: surface samples of the body in the object's distance grid, obstacle points of the object in the body's
-    convex pieces. Balls around runs of points skip what is far. Of these runs every ``slices``-th is looked at, from
-    ``first_run`` on.
+    Of the runs of points every ``slices``-th is looked at, from ``first_run`` on.
     """
     depth = float(0.0)
     b = hand.pieces.body_sphere[body]
-    if b[3] < 0.0:
-        return depth
     centre = wp.transform_point(T, wp.vec3(b[0], b[1], b[2]))
-    if not sdf_below(obj.sdf, centre, b[3]):
-        return depth
-    for k in range(hand.cluster_first[body] + first_run, hand.cluster_first[body + 1], slices):
-        s = hand.cluster_sphere[k]
-        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3]):
-            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
-                depth = deeper(obj.sdf, wp.transform_point(T, hand.samples[i]), depth)
-            if depth > limit:
-                return depth
     T_body = wp.transform_inverse(T)
     first = hand.pieces.body_first[body]
     end = hand.pieces.body_first[body + 1]
@@ -112,6 +100,36 @@ def body_depth_slice(
                 if depth > limit:
                     return depth
     return depth
+
+
+@wp.func
+def body_depth_slice(
+    hand: Hand,
+    obj: Object,
+    body: wp.int32,
+    T: wp.transform,
+    limit: wp.float32,
+    first_run: wp.int32,
+    slices: wp.int32,
+):
+    """Deepest penetration of body and object [m], 0 when apart; stops early above ``limit``. T = T_object_body.
+
+    Both ways: surface samples of the body in the object's distance grid, obstacle points of the object in the body's
+    convex pieces. Balls around runs of points skip what is far. Of these runs every ``slices``-th is looked at, from
+    ``first_run`` on.
+    """
+    depth = float(0.0)
+    b = hand.pieces.body_sphere[body]
+    if b[3] < 0.0 or not sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(b[0], b[1], b[2])), b[3]):
+        return depth
+    for k in range(hand.cluster_first[body] + first_run, hand.cluster_first[body + 1], slices):
+        s = hand.cluster_sphere[k]
+        if sdf_below(obj.sdf, wp.transform_point(T, wp.vec3(s[0], s[1], s[2])), s[3]):
+            for i in range(k * CLUSTER_SIZE, (k + 1) * CLUSTER_SIZE):
+                depth = deeper(obj.sdf, wp.transform_point(T, hand.samples[i]), depth)
+            if depth > limit:
+                return depth
+    return wp.max(depth, obstacles_depth(hand, obj, body, T, limit, first_run, slices))
 
 
 @wp.func

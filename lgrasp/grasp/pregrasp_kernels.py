@@ -5,7 +5,7 @@ import warp as wp
 from lgrasp.grasp.bounds import ANY_PENETRATION
 from lgrasp.grasp.check_kernels import hand_pairs_clear
 from lgrasp.grasp.check_structs import CheckedPostures, Limits, Packed, Places
-from lgrasp.grasp.collision import body_apart, body_depth, body_depth_slice, body_height, resting_plane
+from lgrasp.grasp.collision import body_apart, body_depth, body_far, body_height, obstacles_depth, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held, body_depth_in_held
 from lgrasp.hand.arrays import Hand
 from lgrasp.math.kinematics import group_forward, vec_dof
@@ -180,19 +180,19 @@ def _sinks(
     T_object: wp.transform,
     X: wp.transform,
     off: wp.float32,
-    k: wp.int32,
-    slices: wp.int32,
 ):
-    """True if a body is in what is held, or by slice k of the points of either deeper in the object than it may.
+    """True if points of the object are deeper in a body whose own are off it than they may, or the body is in what is
+    held.
 
     Args:
         T_object: T_object_hand. X: pose of the body in the hand frame.
-        off: how far it must be off the object [m]; below 0 it may be that deep.
+        off: how far the body must be off the object [m]; below 0 they may be that deep.
     """
-    if k == 0 and body_depth_in_held(hand, held, h, body, X, 0.0) > 0.0:
-        return True
     limit = wp.max(0.0, -off)
-    return body_depth_slice(hand, obj, body, T_object * X, limit, k, slices) > limit
+    T = T_object * X
+    if not body_far(hand, obj, body, T, 0.0) and obstacles_depth(hand, obj, body, T, limit, 0, 1) > limit:
+        return True
+    return body_depth_in_held(hand, held, h, body, X, 0.0) > 0.0
 
 
 @wp.kernel
@@ -204,20 +204,18 @@ def check_openings(
     opened: wp.array3d(dtype=vec_dof),
     row: wp.array(dtype=wp.int32),
     off: wp.array2d(dtype=wp.float32),
-    slices: wp.int32,
     clear_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per (slice, body, row): is a body of a touching finger out of the objects by all points, as far open
-    as the first try that is clear by samples? No try is where one is not.
+    """One thread per (body, row): is a body of a touching finger out of the objects by their points, too, as far open
+    as the first try that is clear? No try is where one is not.
 
     Args:
         opened: (m, G, 2) of :func:`~lgrasp.grasp.control_kernels.control_poses`.
         row: (m,) hand of each row, -1 none.
         off: (m, bodies - 1) of :func:`find_distances_off` [m].
-        slices: of the points (:func:`~lgrasp.grasp.collision.depth_slices`).
         clear_out: (m,) of :func:`try_openings`.
     """
-    k, j, i = wp.tid()
+    j, i = wp.tid()
     s = row[i]
     if s < 0:
         return
@@ -230,7 +228,7 @@ def check_openings(
     group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
     h = at.index[at.of[s]] // held.tries
     T_object = wp.transform_inverse(at.pose[at.of[s]])
-    if _sinks(hand, obj, held, h, 1 + j, T_object, X[j], off[i, j], k, slices):
+    if _sinks(hand, obj, held, h, 1 + j, T_object, X[j], off[i, j]):
         clear_out[i] = 0
 
 
@@ -338,7 +336,7 @@ def try_fingers(
     if finger_clear(hand, obj, held, limits, h, g, at.pose[r], at.resting[r], X, off[i]) == 0:
         return
     for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
-        if _sinks(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[r]), X[j], off[i, j], 0, 1):
+        if _sinks(hand, obj, held, h, 1 + j, wp.transform_inverse(at.pose[r]), X[j], off[i, j]):
             return
     wp.atomic_or(clear_out, k, g, 1 << t)
 
