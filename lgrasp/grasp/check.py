@@ -35,10 +35,13 @@ from lgrasp.grasp.control_kernels import control_poses, drop_limp, limit_squeeze
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import LATE, MEASURED, METRICS, REASONS, SHARED, Outcome, bounds_squeeze, failed_squeeze
 from lgrasp.grasp.pregrasp_kernels import (
+    CLOSING_PLACES,
     FINGER_TRIES,
     OPENING_SHARES,
     check_openings,
+    find_crossings,
     find_distances_off,
+    keep_closed,
     measure_closing,
     open_fingers,
     open_poses,
@@ -212,6 +215,9 @@ class Check:
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)
         inputs = [hand, self.held.struct, limits, at, opened, row, stuck, clear]
         wp.launch(open_fingers, m, inputs, [packed], device=d)
+        crossed = wp.zeros(m, dtype=wp.int32, device=d)
+        wp.launch(find_crossings, (CLOSING_PLACES, m), [hand, at, row, packed], [crossed], device=d)
+        wp.launch(keep_closed, m, [hand, at, row, crossed], [packed], device=d)
         wp.launch(measure_closing, (model.groups, m), [hand, obj, at, row, off], [packed], device=d)
         wp.launch(grasp_epsilon, m, [obj, seed, limits, places, at, row], [packed], device=d)
         wp.launch(pack_rows, m, [hand, places, at, found, row], [packed], device=d)

@@ -8,7 +8,7 @@ from lgrasp.grasp.check_structs import CheckedPostures, Limits, Packed, Places
 from lgrasp.grasp.collision import body_apart, body_depth, body_far, body_height, obstacles_depth, resting_plane
 from lgrasp.grasp.held import Held, body_clear_of_held, body_depth_in_held
 from lgrasp.hand.arrays import Hand
-from lgrasp.math.kinematics import group_forward, vec_dof
+from lgrasp.math.kinematics import group_dofs, group_forward, vec_dof
 from lgrasp.math.limits import MAX_BODIES
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
@@ -19,6 +19,8 @@ OPENING_SHARES = wp.constant(5)
 """Shares of the way open that are tried."""
 FINGER_TRIES = wp.constant(3 * OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
+CLOSING_PLACES = wp.constant(3)
+"""Places on the way from q_pregrasp to q, in equal parts of it, where fingers must be out of each other."""
 _NOT_TOUCHING = wp.constant(1.0e6)  # opening of a hand no finger of which touches
 _PARTS = wp.constant(3)  # of the way from q_pregrasp to q
 _DEEPEST = wp.constant(ANY_PENETRATION)  # [m]
@@ -394,6 +396,68 @@ def open_fingers(
     put_opening(i, least, most, packed_out)
 
 
+@wp.func
+def _closing(hand: Hand, g: wp.int32, share: wp.float32, q: vec_dof, packed: Packed, i: wp.int32):
+    """A finger of row i on its straight way from ``q_pregrasp`` (share 0) to q (1)."""
+    x = group_dofs(hand.kin, g, packed.q_pregrasp, i)
+    return x + share * (q - x)
+
+
+@wp.kernel
+def find_crossings(
+    hand: Hand,
+    at: CheckedPostures,
+    row: wp.array(dtype=wp.int32),
+    packed: Packed,
+    crossed_out: wp.array(dtype=wp.int32),
+):
+    """One thread per (place, row): do fingers that close go through each other, or the base, there?
+
+    Args:
+        row: (m,) hand of each row, -1 none.
+        crossed_out: (m,) 1: they do; of zeros.
+    """
+    place, i = wp.tid()
+    s = row[i]
+    if s < 0 or crossed_out[i] == 1 or packed.closing_travel[i] == 0.0:
+        return
+    X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
+    share = float(1 + place) / float(1 + CLOSING_PLACES)
+    moves = int(0)
+    for g in range(hand.kin.groups):
+        x = _closing(hand, g, share, at.posture[s, g], packed, i)
+        group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
+        if joint_motion(hand, g, x, at.posture[s, g]) > 0.0:
+            moves = moves | (1 << (1 + g))
+    for b in range(1, hand.kin.groups + 1):
+        for a in range(b):
+            if ((moves >> a) | (moves >> b)) & 1 == 1 and not hand_pairs_clear(hand, a, b, X, 0.0):
+                crossed_out[i] = 1
+                return
+
+
+@wp.kernel
+def keep_closed(
+    hand: Hand,
+    at: CheckedPostures,
+    row: wp.array(dtype=wp.int32),
+    crossed: wp.array(dtype=wp.int32),
+    packed_out: Packed,
+):
+    """Hands whose fingers would cross as they close are not opened, one thread per row.
+
+    Args:
+        row: (m,) hand of each row, -1 none.
+        crossed: (m,) of :func:`find_crossings`.
+    """
+    i = wp.tid()
+    s = row[i]
+    if s >= 0 and crossed[i] == 1:
+        for g in range(hand.kin.groups):
+            put_pregrasp(hand, g, at.posture[s, g], at.posture[s, g], i, packed_out)
+        put_opening(i, 0.0, 0.0, packed_out)
+
+
 @wp.kernel
 def measure_closing(
     hand: Hand,
@@ -418,11 +482,7 @@ def measure_closing(
     if s < 0:
         return
     q = at.posture[s, g]
-    x = q
-    first = hand.kin.dof_first[g]
-    for d in range(hand.kin.dof_first[g + 1] - first):
-        x[d] = packed_out.q_pregrasp[i, hand.kin.dof_index[first + d]]
-    if joint_motion(hand, g, x, q) == 0.0:
+    if joint_motion(hand, g, group_dofs(hand.kin, g, packed_out.q_pregrasp, i), q) == 0.0:
         return
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     before = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
@@ -432,7 +492,8 @@ def measure_closing(
     deepest = float(0.0)
     farthest = float(0.0)
     for part in range(1, _PARTS + 1):
-        group_forward(hand.kin, g, x + (float(part) / float(_PARTS)) * (q - x), X, hand.kin.joint_first[g])
+        x = _closing(hand, g, float(part) / float(_PARTS), q, packed_out, i)
+        group_forward(hand.kin, g, x, X, hand.kin.joint_first[g])
         for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
             ball = hand.pieces.body_sphere[1 + j]
             middle = wp.vec3(ball[0], ball[1], ball[2])

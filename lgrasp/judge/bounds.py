@@ -20,7 +20,7 @@ RESTING_GAP = 1e-3
 APPROACH_LENGTH, APPROACH_STEP = 0.15, 0.004
 """Way of the open hand to the grasp of an object on a table, and between the places where it is judged [m]."""
 CLOSING = (0.2, 0.35, 0.5, 0.65, 0.8)
-"""Parts of the way from ``q_pregrasp`` to ``q`` at which the hand is above the table, too."""
+"""Parts of the way from ``q_pregrasp`` to ``q`` at which links are out of each other and above the table, too."""
 REGION_WEIGHT = 0.5
 """Least weight of a surface point that belongs to a region."""
 SHARE_TOLERANCE = 1e-3

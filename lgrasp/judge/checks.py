@@ -25,6 +25,7 @@ CHECKS: dict[str, tuple[str, float]] = {
     "penetration": ("penetration_mm", 1e3 * bounds.PENETRATION),
     "pregrasp": ("pregrasp_mm", 1e3 * bounds.PENETRATION),
     "self_penetration": ("self_penetration_mm", 1e3 * bounds.SELF_PENETRATION),
+    "closing": ("closing_mm", 1e3 * bounds.SELF_PENETRATION),
     "contact_on_object": ("contact_object_mm", 1e3 * bounds.CONTACT_DISTANCE),
     "contact_on_link": ("contact_link_mm", 1e3 * bounds.CONTACT_DISTANCE),
     "normal": ("normal_deg", bounds.NORMAL_DEG),
@@ -82,7 +83,8 @@ class RowChecks:
                 here = self.index[good, o] >= 0
                 turns = Rotation.from_quat(poses[here, o, 3:], scalar_first=True)
                 T_objects[here, o] = pose_transforms(poses[here, o, :3], turns)
-            self._self_penetration(T_links)
+            self._set("self_penetration", 1e3 * self._self_penetration(T_links, self.self_pairs))
+            self._closing()
             self._penetration(T_links, T_objects)
             self._contacts(T_links, T_objects)
             if shard.table:
@@ -217,7 +219,16 @@ class RowChecks:
         found = disobeys(asked, shard.link_names, links, normals, T_thumb, T_objects, planes)
         self.failed["steered"][good] = found
 
-    def _self_penetration(self, T_links: np.ndarray) -> None:
+    def _closing(self) -> None:
+        """Links in each other at ``q_pregrasp`` and on the straight way to ``q``."""
+        if "q_pregrasp" in self.g:
+            before, q, n = self._full("q_pregrasp"), self._full("q"), len(self.good)
+            ways = [{name: (1 - t) * before[name] + t * q[name] for name in q} for t in (0.0, *bounds.CLOSING)]
+            depths = [self._self_penetration(self.hand.forward(way, n), Counter()) for way in ways]
+            self._set("closing", 1e3 * np.max(depths, axis=0))
+
+    def _self_penetration(self, T_links: np.ndarray, pairs: Counter[str]) -> np.ndarray:
+        """Deepest penetration of links [m], (n,); ``pairs`` grows by those beyond the bound."""
         hand, depth = self.hand, np.zeros(len(self.good))
         poses = PlacedSolids(hand.solids, T_links)
         beyond: dict[str, set[int]] = {}
@@ -228,8 +239,8 @@ class RowChecks:
                 if d > bounds.SELF_PENETRATION:
                     name = " x ".join(sorted(hand.links[hand.solids[k].link] for k in (a, b)))
                     beyond.setdefault(name, set()).add(i)
-        self.self_pairs = Counter({k: len(v) for k, v in beyond.items()})
-        self._set("self_penetration", 1e3 * depth)
+        pairs.update({k: len(v) for k, v in beyond.items()})
+        return depth
 
     def _penetration(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
         in_link, in_object = self._hand_in_objects(T_links, T_objects)

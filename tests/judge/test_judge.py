@@ -66,17 +66,19 @@ def test_valid_row_passes_with_exact_numbers(tmp_path: Path) -> None:
 
 
 def test_the_open_hand_and_the_couplings_of_the_rules_count(tmp_path: Path) -> None:
-    path = write_shard(tmp_path / "s.h5", [row(), row(), row(q=[0.025, 0.026, 0.3]), row()])
+    path = write_shard(tmp_path / "s.h5", [row(), row(), row(q=[0.025, 0.026, 0.3]), row(), row()])
     coupling = {"slide_right": {"joint": "slide_left", "multiplier": 1.0, "offset": 0.0}}
     with h5py.File(path, "r+") as f:
         f.attrs["config"] = json.dumps({"hand_rules": json.dumps({"mimic": coupling})})
         opened = f["grasps/q"][()] + np.array([0.005, 0.005, 0, 0], "f4")
         opened[1, 2] = -1.001
         opened[3, :2] -= 0.008  # 3 mm into the object
+        opened[4, :2] = 0.002  # and the jaws 6 mm into each other
         f["grasps/q_pregrasp"] = opened
     report = judge(path)
-    assert _failed(report) == [set(), {"limits", "mimic_limits", "mimic"}, {"mimic"}, {"pregrasp"}]
-    assert report.values["pregrasp_mm"] == pytest.approx([0.0, 0.0, 0.0, 3.0], abs=1e-3)
+    assert _failed(report) == [set(), {"limits", "mimic_limits", "mimic"}, {"mimic"}, {"pregrasp"}, {"pregrasp", "closing"}]
+    assert report.values["pregrasp_mm"][:4] == pytest.approx([0.0, 0.0, 0.0, 3.0], abs=1e-3)
+    assert report.values["closing_mm"] == pytest.approx([0.0, 0.0, 0.0, 0.0, 6.0], abs=1e-3)
 
 
 @pytest.mark.parametrize("told", [0.0, np.nan, 0.5])
@@ -173,7 +175,7 @@ def test_planted_defects_are_caught(tmp_path: Path) -> None:
     assert report.values["object_in_link_mm"][-2] == pytest.approx(5.0, abs=0.2)
     assert found[-1] == set()
     assert report.valid.sum() == 1
-    assert set().union(*found) == set(CHECKS) - OF_SEVERAL - OF_TABLES - OF_REGIONS - {"steered", "pregrasp"}
+    assert set().union(*found) == set(CHECKS) - OF_SEVERAL - OF_TABLES - OF_REGIONS - {"steered", "pregrasp", "closing"}
 
 
 def test_original_files_override_the_shard(tmp_path: Path) -> None:
