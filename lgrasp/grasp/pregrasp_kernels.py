@@ -20,7 +20,8 @@ OPENING_SHARES = wp.constant(5)
 FINGER_TRIES = wp.constant(3 * OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
 CLOSING_PLACES = wp.constant(3)
-"""Places on the way from q_pregrasp to q, in equal parts of it, where fingers must be out of each other."""
+"""Most places on the way from q_pregrasp to q, in equal parts of it, where fingers must be out of each other."""
+_CLOSING_STEP = wp.constant(0.15)  # [rad or m] of the joint that moves most, if these are enough
 _NOT_TOUCHING = wp.constant(1.0e6)  # opening of a hand no finger of which touches
 _PARTS = wp.constant(3)  # of the way from q_pregrasp to q
 _DEEPEST = wp.constant(ANY_PENETRATION)  # [m]
@@ -419,10 +420,11 @@ def find_crossings(
     """
     place, i = wp.tid()
     s = row[i]
-    if s < 0 or crossed_out[i] == 1 or packed.closing_travel[i] == 0.0:
+    places = wp.min(int(packed.closing_travel[i] / _CLOSING_STEP), int(CLOSING_PLACES))
+    if s < 0 or crossed_out[i] == 1 or place >= places:
         return
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
-    share = float(1 + place) / float(1 + CLOSING_PLACES)
+    share = float(1 + place) / float(1 + places)
     moves = int(0)
     for g in range(hand.kin.groups):
         x = _closing(hand, g, share, at.posture[s, g], packed, i)
