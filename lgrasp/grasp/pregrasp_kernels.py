@@ -21,7 +21,7 @@ FINGER_TRIES = wp.constant(3 * OPENING_SHARES)
 """Postures of a finger that is opened by itself."""
 CLOSING_PLACES = wp.constant(3)
 """Most places on the way from q_pregrasp to q, in equal parts of it, where fingers must be out of each other."""
-_CLOSING_STEP = wp.constant(0.15)  # [rad or m] of the joint that moves most, if these are enough
+_CLOSING_STEP = wp.constant(0.15)  # [rad or m]: the joint that moves most has a place for each, if so many are enough
 _NOT_TOUCHING = wp.constant(1.0e6)  # opening of a hand no finger of which touches
 _PARTS = wp.constant(3)  # of the way from q_pregrasp to q
 _DEEPEST = wp.constant(ANY_PENETRATION)  # [m]
@@ -420,8 +420,10 @@ def find_crossings(
     """
     place, i = wp.tid()
     s = row[i]
+    if s < 0 or crossed_out[i] == 1:
+        return
     places = wp.min(int(packed.closing_travel[i] / _CLOSING_STEP), int(CLOSING_PLACES))
-    if s < 0 or crossed_out[i] == 1 or place >= places:
+    if place >= places:
         return
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     share = float(1 + place) / float(1 + places)
