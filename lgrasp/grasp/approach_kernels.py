@@ -4,6 +4,7 @@ import warp as wp
 
 from lgrasp.grasp.check_kernels import ALL, TOUCHING
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed
+from lgrasp.grasp.closing_kernels import closing_finger
 from lgrasp.grasp.collision import body_depth, body_height, resting_plane
 from lgrasp.grasp.outcomes import Outcome
 from lgrasp.hand.arrays import Hand
@@ -244,7 +245,8 @@ def close_above(
     plane = resting_plane(obj, at.pose[at.of[s]], at.resting[at.of[s]])
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)
     for part in range(1, _PARTS):
-        group_forward(hand.kin, g, x + (float(part) / float(_PARTS)) * (q - x), X, hand.kin.joint_first[g])
+        between = closing_finger(x, q, float(part) / float(_PARTS))
+        group_forward(hand.kin, g, between, X, hand.kin.joint_first[g])
         for j in range(hand.kin.joint_first[g], hand.kin.joint_first[g + 1]):
             if body_height(hand.pieces, 1 + j, X[j], plane, limits.min_table_distance) < limits.min_table_distance:
                 refused_out[i] = 1

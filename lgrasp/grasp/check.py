@@ -30,19 +30,16 @@ from lgrasp.grasp.check_kernels import (
     pack_rows,
 )
 from lgrasp.grasp.check_structs import CheckedPostures, Findings, Limits, Packed, Places, device_limits, new_findings
+from lgrasp.grasp.closing_kernels import CLOSING_PLACES, find_crossings, keep_closed, measure_closing
 from lgrasp.grasp.collision import depth_slices
 from lgrasp.grasp.control_kernels import control_poses, drop_limp, limit_squeeze, press_shared
 from lgrasp.grasp.held import HeldArrays, hold_nothing
 from lgrasp.grasp.outcomes import LATE, MEASURED, METRICS, REASONS, SHARED, Outcome, bounds_squeeze, failed_squeeze
 from lgrasp.grasp.pregrasp_kernels import (
-    CLOSING_PLACES,
     FINGER_TRIES,
     OPENING_SHARES,
     check_openings,
-    find_crossings,
     find_distances_off,
-    keep_closed,
-    measure_closing,
     open_fingers,
     open_poses,
     try_fingers,
@@ -208,8 +205,8 @@ class Check:
         wp.launch(find_distances_off, (self.bodies - 1, m), [hand, obj, limits, places, at, row], [off], device=d)
         inputs = [hand, obj, self.held.struct, limits, at, opened, row, off]
         wp.launch(try_openings, (OPENING_SHARES, m), inputs, [tried], device=d)
-        opening = [hand, obj, self.held.struct, at, opened, row, off]
-        wp.launch(check_openings, (self.bodies - 1, m), opening, [tried], device=d)
+        again = [hand, obj, self.held.struct, at, opened, row, off]
+        wp.launch(check_openings, (self.bodies - 1, m), again, [tried], device=d)
         wp.launch(open_poses, m, [hand, at, opened, row, tried], [packed, stuck], device=d)
         clear = wp.zeros((m, model.groups), dtype=wp.int32, device=d)
         wp.launch(try_fingers, (m, model.groups, FINGER_TRIES), [*inputs, stuck], [clear], device=d)

@@ -83,12 +83,12 @@ class RowChecks:
                 here = self.index[good, o] >= 0
                 turns = Rotation.from_quat(poses[here, o, 3:], scalar_first=True)
                 T_objects[here, o] = pose_transforms(poses[here, o, :3], turns)
-            self._set("self_penetration", 1e3 * self._self_penetration(T_links, self.self_pairs))
-            self._closing()
-            self._penetration(T_links, T_objects)
+            T_closing = self._closing()
+            self._self_penetration(T_links, T_closing)
+            self._penetration(T_links, T_closing[:1], T_objects)
             self._contacts(T_links, T_objects)
             if shard.table:
-                self._table(T_links, T_objects[:, 0])
+                self._table([T_links, *T_closing], T_objects[:, 0])
             self._regions()
             if shard.asked:
                 self._steered(shard.asked, T_links, T_objects[:, 0])
@@ -170,21 +170,29 @@ class RowChecks:
         """Values of all joints."""
         return self.hand.resolve_joints(self._values(posture), len(self.good))
 
-    def _table(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
-        """The hand above the table at the grasp, before it and along the way; the way clear of the object."""
+    def _closing(self) -> list[np.ndarray]:
+        """Poses of the links at ``q_pregrasp`` and on the straight way to ``q``, (n, L, 4, 4) each; of no open hand
+        none."""
+        if "q_pregrasp" not in self.g:
+            return []
+        before, q = self._full("q_pregrasp"), self._full("q")
+        ways = [{name: (1 - t) * before[name] + t * q[name] for name in q} for t in (0.0, *bounds.CLOSING)]
+        return [self.hand.forward(way, len(self.good)) for way in ways]
+
+    def _table(self, T_hand: list[np.ndarray], T_objects: np.ndarray) -> None:
+        """The hand above the table at the grasp, before it and along the way; the way clear of the object.
+
+        Args:
+            T_hand: poses of the links at the grasp, open, and while they close.
+        """
         good, hand = self.good, self.hand
         pose, back = self.table["pose"][good].astype(int), -self.table["approach"][good]
-        before, q = self._full("q_pregrasp"), self._full("q")
-        T_open = hand.forward(before, len(good))
-        T_closing = [
-            hand.forward({name: (1 - t) * before[name] + t * q[name] for name in q}, len(good)) for t in bounds.CLOSING
-        ]
         found = np.zeros((3, len(good)))
         for k, obj in enumerate(self.shard.objects):
             m = np.flatnonzero(self.index[good, 0] == k)
             planes = self.shard.tables[k][pose[m]]
-            closing = [T[m] for T in (T_links, *T_closing)]
-            found[:, m] = on_table(hand, obj, planes, T_objects[m], closing, T_open[m], back[m])
+            grasp, opened, *closing = (T[m] for T in T_hand)
+            found[:, m] = on_table(hand, obj, planes, T_objects[m], [grasp, *closing], opened, back[m])
         if self.shard.asked and self.shard.asked.plane is not None:
             found[1] = 0.0  # a plane that a user asks for need not touch the object
         for check, value in zip(("table", "resting", "approach"), found, strict=True):
@@ -219,16 +227,14 @@ class RowChecks:
         found = disobeys(asked, shard.link_names, links, normals, T_thumb, T_objects, planes)
         self.failed["steered"][good] = found
 
-    def _closing(self) -> None:
-        """Links in each other at ``q_pregrasp`` and on the straight way to ``q``."""
-        if "q_pregrasp" in self.g:
-            before, q, n = self._full("q_pregrasp"), self._full("q"), len(self.good)
-            ways = [{name: (1 - t) * before[name] + t * q[name] for name in q} for t in (0.0, *bounds.CLOSING)]
-            depths = [self._self_penetration(self.hand.forward(way, n), Counter()) for way in ways]
-            self._set("closing", 1e3 * np.max(depths, axis=0))
+    def _self_penetration(self, T_links: np.ndarray, T_closing: list[np.ndarray]) -> None:
+        depth, self.self_pairs = self._links_in_links(T_links)
+        self._set("self_penetration", 1e3 * depth)
+        if T_closing:
+            self._set("closing", 1e3 * np.max([self._links_in_links(T)[0] for T in T_closing], axis=0))
 
-    def _self_penetration(self, T_links: np.ndarray, pairs: Counter[str]) -> np.ndarray:
-        """Deepest penetration of links [m], (n,); ``pairs`` grows by those beyond the bound."""
+    def _links_in_links(self, T_links: np.ndarray) -> tuple[np.ndarray, Counter[str]]:
+        """Deepest penetration of links [m], (n,), and in how many rows which pairs are beyond the bound."""
         hand, depth = self.hand, np.zeros(len(self.good))
         poses = PlacedSolids(hand.solids, T_links)
         beyond: dict[str, set[int]] = {}
@@ -239,17 +245,15 @@ class RowChecks:
                 if d > bounds.SELF_PENETRATION:
                     name = " x ".join(sorted(hand.links[hand.solids[k].link] for k in (a, b)))
                     beyond.setdefault(name, set()).add(i)
-        pairs.update({k: len(v) for k, v in beyond.items()})
-        return depth
+        return depth, Counter({k: len(v) for k, v in beyond.items()})
 
-    def _penetration(self, T_links: np.ndarray, T_objects: np.ndarray) -> None:
+    def _penetration(self, T_links: np.ndarray, T_open: list[np.ndarray], T_objects: np.ndarray) -> None:
         in_link, in_object = self._hand_in_objects(T_links, T_objects)
         self.values["object_in_link_mm"][self.good] = 1e3 * in_link
         self.values["link_in_object_mm"][self.good] = 1e3 * in_object
         self._set("penetration", 1e3 * np.maximum(in_link, in_object))
-        if "q_pregrasp" in self.g:
-            T_open = self.hand.forward(self._full("q_pregrasp"), len(self.good))
-            self._set("pregrasp", 1e3 * np.max(self._hand_in_objects(T_open, T_objects), axis=0))
+        for T in T_open:
+            self._set("pregrasp", 1e3 * np.max(self._hand_in_objects(T, T_objects), axis=0))
         if T_objects.shape[1] > 1:
             self._between_objects(T_objects)
 
