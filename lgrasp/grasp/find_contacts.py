@@ -1,14 +1,15 @@
 """Where hands in a posture touch an object, for rows whose contacts are not known."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.check import ContactTable
+from lgrasp.grasp.check import ContactTable, check_grasps
 from lgrasp.grasp.check_structs import Limits, device_limits
 from lgrasp.grasp.contact_kernels import PalmarRuns, RunContacts, choose_contacts, link_contacts, tell_contacts
+from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.contact_surface import ContactSurface, contact_surface
 from lgrasp.math.limits import MAX_CONTACTS
@@ -50,6 +51,22 @@ def find_contacts(
     )
     wp.launch(tell_contacts, found.run.shape, [obj.struct, runs, *found], list(out), device=d)
     return out
+
+
+def check_found(
+    hand: HandArrays,
+    obj: ObjectArrays,
+    pose: np.ndarray | wp.array,
+    q: np.ndarray | wp.array,
+    bounds: GraspBounds,
+    *,
+    contacts: ContactTable | None = None,
+    palmar: ContactSurface | None = None,
+    **options: Any,
+) -> tuple[GraspTable, np.ndarray]:
+    """:func:`~lgrasp.grasp.check.check_grasps` of hands whose contacts are found unless they are given."""
+    contacts = contacts or find_contacts(hand, obj, pose, q, bounds, palmar)
+    return check_grasps(hand, obj, pose, q, contacts, bounds, **options)
 
 
 def palmar_runs(hand: HandArrays, side: ContactSurface, at: np.ndarray | None = None) -> PalmarRuns:

@@ -50,10 +50,10 @@ FAILED_BOUNDS = (
     *("none", "min_contacts", "max_gap", "max_normal_angle", "min_self_distance", "max_penetration", "max_gswo"),
     *("max_unresisted_load", "min_table_distance", "approach", "min_squeeze_travel", "min_stable_squeeze"),
     *("max_closing_travel", "min_epsilon", "min_pregrasp_opening", "min_hold_probability"),
-    *("max_closing_penetration", "max_closing_sweep", "min_force_share"),
+    *("max_closing_penetration", "max_closing_sweep", "min_force_share", "steered"),
 )
 """By code, the first bound that a row fails, of :class:`~lgrasp.grasp.bounds.GraspBounds`; ``approach``: no straight
-way of the open hand to the object clears the table."""
+way of the open hand to the object clears the table; ``steered``: it touches otherwise than is asked."""
 
 _FAILED = {
     Outcome.SELF_COLLISION: "min_self_distance",
@@ -62,6 +62,7 @@ _FAILED = {
     Outcome.UNRESISTED_LOAD: "max_unresisted_load",
     Outcome.TABLE: "min_table_distance",
     Outcome.APPROACH: "approach",
+    Outcome.TOUCH: "steered",
     Outcome.HOLD: "min_hold_probability",
 }
 

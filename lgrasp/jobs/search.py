@@ -21,7 +21,6 @@ from lgrasp.jobs.records import hand_config, hand_record, make_scene, mesh_blobs
 from lgrasp.jobs.requests.search import SearchRequest
 from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.tally import add_counts, add_seconds, covered
-from lgrasp.steer.touch import describe_touching
 
 
 class SearchJob(SearchRequest, Job):
@@ -116,12 +115,10 @@ class SearchJob(SearchRequest, Job):
 
     def asked(self) -> dict[str, Any]:
         """What the config also tells once the inputs are loaded: what is asked of the rows in the words of the hand."""
-        steer, inputs = self.pipeline.steer, self.inputs
-        if not steer.asks:
+        if not self.pipeline.steer.asks:
             return {}
-        told = describe_touching(steer, inputs.steer.touching, inputs.hand.model, inputs.steer.poses)
         hand = self.pipeline.hand.model_dump(mode="json", include={"sides", "thumb"}, exclude_defaults=True)
-        return {"steered": told | hand}
+        return {"steered": self.inputs.steer.told | hand}
 
     def difference(self, path: Path) -> str:
         with ShardReader(path) as reader:

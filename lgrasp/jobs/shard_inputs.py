@@ -98,9 +98,10 @@ def arrays_of_shard(cache: Cache, record: HandRecord, config: Mapping[str, Any],
     """The same on the device; the latest stays there."""
 
     def make() -> HandArrays:
-        return upload_hand(hand_of_shard(cache, record, config, device)[1], device.alias)
+        return upload_hand(hand_of_shard(cache, record, config, device)[1], device.alias, surface.thumb)
 
-    return cache.kept.get("hand of shard", (device.alias, record.sha256, str(_surface(config))), make)
+    surface = _surface(config)
+    return cache.kept.get("hand of shard", (device.alias, record.sha256, str(surface)), make)
 
 
 def object_of_shard(cache: Cache, record: ObjectRecord, device: Device) -> ObjectModel:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.shares import entries_of
@@ -33,6 +34,13 @@ def surface_weights(
         for regions in (touch, avoid)
     ]
     return SurfaceWeights(points, both[0], both[1], min((region.share for region in touch), default=1.0))
+
+
+def stored_weights(model: ObjectModel, regions: np.ndarray, share: float) -> SurfaceWeights:
+    """What a shard says of regions (:meth:`SurfaceWeights.table`, (S, 5)), for contact points of the same object."""
+    points = (model.contact_points + model.center).astype(np.float32)
+    touch, avoid = regions[cKDTree(regions[:, :3]).query(points)[1], 3:].T
+    return SurfaceWeights(points, touch, avoid, share)
 
 
 def steer_object(model: ObjectModel, weights: SurfaceWeights, *, seed: int = 0, device: str = "cpu") -> SteeredObject:

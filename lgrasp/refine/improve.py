@@ -1,18 +1,14 @@
 """Hands moved until they pass the checks: a local search, evaluated on its way, restarted nearby if it fails."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from lgrasp.geometry.poses import device_inverse
-from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.check import check_grasps
-from lgrasp.grasp.find_contacts import find_contacts
 from lgrasp.grasp.outcomes import Outcome
 from lgrasp.grasp.tables import GraspTable, choose_grasps, join_rows
 from lgrasp.hand.arrays import HandArrays
-from lgrasp.object.arrays import ObjectArrays
 from lgrasp.refine.descent import Descent
 from lgrasp.refine.hands import Hands
 from lgrasp.runtime.cores import cores
@@ -21,14 +17,15 @@ _ROUNDS_PER_LOOK = 4  # matching rounds between two looks
 _START_SHIFT, _START_BEND = 0.003, 0.03  # spread of further starts [m], [rad or m]
 _CPU_ROWS = 32  # of one thread
 
+Check = Callable[..., tuple[GraspTable, np.ndarray]]
+
 
 def improve(
     search: Descent,
     hand: HandArrays,
-    obj: ObjectArrays,
+    check: Check,
     pose: np.ndarray,
     q: np.ndarray,
-    bounds: GraspBounds,
     *,
     tries: np.ndarray,
     resting: np.ndarray | None = None,
@@ -41,6 +38,7 @@ def improve(
     does not depend on the others.
 
     Args:
+        check: what the checks find of postures, as :func:`~lgrasp.grasp.find_contacts.check_found` does.
         pose: T_hand_object of the object's internal frame, x y z [m] qx qy qz qw, (n, 7).
         q: joint positions within their limits [rad or m], (n, K).
         tries: most searches of each hand, (n,).
@@ -61,8 +59,7 @@ def improve(
                 break
             planes = None if resting is None else resting[at]
             for back, joints in _looks(search, _start(search, hand, pose[at], q[at], number), number):
-                contacts = find_contacts(hand, obj, back, joints, bounds)
-                found, now = check_grasps(hand, obj, back, joints, contacts, bounds, resting=planes, index=index[at])
+                found, now = check(back, joints, resting=planes, index=index[at])
                 if table is None:
                     table, outcome = found, now
                     continue

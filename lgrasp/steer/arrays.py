@@ -1,6 +1,7 @@
 """A steering on a device, as kernels of the stages read it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,7 +13,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.structs import upload_struct
 from lgrasp.steer.params import NOTHING, Steering
 from lgrasp.steer.poses import read_poses
-from lgrasp.steer.touch import Touching, find_touching
+from lgrasp.steer.touch import Touching, describe_touching, find_touching
 
 wp.set_module_options(KERNEL_OPTIONS)
 
@@ -37,6 +38,8 @@ class SteerArrays:
     struct: "Steer"
     poses: np.ndarray | None = None
     """T_hand_object that are asked for, x y z [m] qw qx qy qz, shape (T, 7)."""
+    told: dict[str, Any] = field(default_factory=dict)
+    """What is asked in the words of the hand (:func:`~lgrasp.steer.touch.describe_touching`); empty if nothing is."""
 
     @property
     def fingers(self) -> int:
@@ -71,7 +74,8 @@ def upload_steering(
     poses = read_poses(steering.pose) if steering.pose else None
     if poses is not None:
         values["poses"] = internal_poses(poses, np.zeros(3) if center is None else center)
-    return SteerArrays(touching, upload_struct(Steer, hand.device, values), poses)
+    told = describe_touching(steering, touching, hand.model, poses) if steering.asks else {}
+    return SteerArrays(touching, upload_struct(Steer, hand.device, values), poses, told)
 
 
 def steer_nothing(hand: HandArrays) -> SteerArrays:

@@ -92,13 +92,6 @@ def describe_touching(
     return told | steering.model_dump(mode="json", include={"grasp_type", "approach", "above"}, exclude_none=True)
 
 
-def moved_rows(told: Mapping[str, Any]) -> dict[str, Any]:
-    """``steered`` of a config for rows whose hand and object have moved since: they are above the plane still, and
-    from as many poses."""
-    kept = {name: told[name] for name in ("above", "pose_count") if name in told}
-    return {"steered": kept} if kept else {}
-
-
 def _links(names: Sequence[str], model: HandModel) -> list[int]:
     """Indices of contact links."""
     known = [model.tree.link_names[link] for link in np.unique(model.contact_link)]

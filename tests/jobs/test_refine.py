@@ -225,15 +225,6 @@ def test_metrics_of_the_hold_test_are_left_out(source, done, refine, tmp_path):
     assert done.header.config["bounds"]["numbers"]["min_hold_probability"] == 0
 
 
-def test_regions_are_not_claimed_of_refined_rows(source, refine, tmp_path):
-    shard = read_shard(source)
-    asked = replace(shard.objects[0], regions=np.ones((9, 5), "f4"), touch_share=0.5)
-    write_shard(tmp_path / "steered.h5", replace(shard, objects=[asked]))
-    still = RefineParams(matching_rounds=0)
-    (object_,) = read_shard(refine(tmp_path / "steered.h5", tmp_path / "out", params=still)).objects
-    assert (object_.regions, object_.touch_share) == (None, 1.0)
-
-
 def test_a_row_does_not_depend_on_the_others(source, done, refine, tmp_path):
     shard = read_shard(source)
     some = np.array([7, 4, 21, 12])

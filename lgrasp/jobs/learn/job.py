@@ -3,6 +3,7 @@
 import copy
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,8 +14,7 @@ from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.rotations import inverse_motion, pose_from_motion
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.check import check_grasps
-from lgrasp.grasp.find_contacts import find_contacts
+from lgrasp.grasp.find_contacts import check_found
 from lgrasp.grasp.outcomes import Outcome
 from lgrasp.grasp.tables import GraspTable
 from lgrasp.hand.arrays import HandArrays, upload_hand
@@ -181,10 +181,10 @@ def _grasps(
     """Answers as they are, and moved by a local search, each with what the checks find (Outcome, (n,))."""
     pose = pose_from_motion(*inverse_motion(coarse.R, coarse.t)).cpu().numpy()
     q, obj, search = coarse.q.cpu().numpy(), upload_object(model, hand.device), refine_params(coarse=True)
-    alone = check_grasps(hand, obj, pose, q, find_contacts(hand, obj, pose, q, bounds), bounds)
+    check = partial(check_found, hand, obj, bounds=bounds)
     descent = Refiner(hand.model, model, search, device=hand.device).search
     index, tries = np.arange(len(q)), np.full(len(q), search.tries)
-    return alone, improve(descent, hand, obj, pose, q, bounds, tries=tries, index=index)
+    return check(pose, q), improve(descent, hand, check, pose, q, tries=tries, index=index)
 
 
 def _valid(names: list[str], found: Sequence[tuple[GraspTable, np.ndarray]]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -9,8 +10,8 @@ import torch
 
 from lgrasp.geometry.poses import internal_poses
 from lgrasp.grasp.bounds import GraspBounds
-from lgrasp.grasp.check import check_grasps, known_contacts
-from lgrasp.grasp.find_contacts import find_contacts
+from lgrasp.grasp.check import known_contacts
+from lgrasp.grasp.find_contacts import check_found
 from lgrasp.grasp.outcomes import Outcome, failed_bounds
 from lgrasp.grasp.records import GraspRows, padded
 from lgrasp.grasp.rows import grasp_rows, press
@@ -19,11 +20,12 @@ from lgrasp.grasp.tables import CONTACTS, GraspTable, choose_grasps, join_rows, 
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.math.limits import MAX_CONTACTS
 from lgrasp.object.arrays import ObjectArrays, upload_object
-from lgrasp.object.model import ObjectModel
+from lgrasp.object.model import ObjectModel, SteeredObject
 from lgrasp.refine.energy import Energies
 from lgrasp.refine.improve import improve
 from lgrasp.refine.refiner import Refiner, table_pose
 from lgrasp.stages.refine.params import RefineParams
+from lgrasp.steer.demands import Demands
 
 _BATCH_ROWS = 256  # at a time
 _MAX_OBJECT_DISTANCE = 0.5  # [m] from the object: nothing pulls there
@@ -53,11 +55,12 @@ class Moved(NamedTuple):
 
 def move_rows(
     hand: HandArrays,
-    obj: ObjectModel,
+    obj: ObjectModel | SteeredObject,
     rows: GraspRows,
     params: RefineParams,
     bounds: GraspBounds,
     *,
+    asked: Demands | None,
     planes: np.ndarray | None,
     keep_invalid: bool,
     stored: bool,
@@ -70,18 +73,21 @@ def move_rows(
     Rows that pass in neither posture are left out.
 
     Args:
+        obj: the object, or what is left of it for contacts.
+        asked: what rows must obey.
         planes: those that the object rests on, (T, 5), where rows are of objects on a table: they must stay above it.
         keep_invalid: those rows are kept too, refined, with their own metrics, ``valid`` 0 and ``failed_bound``.
         stored: contacts of the rows are known, and rows that are not replaced stay as they are.
         measured: the rows, their control poses and metrics, are of these bounds.
     """
-    refiner = Refiner(hand.model, obj, params, device=hand.device)
     arrays = upload_object(obj, hand.device, planes)
+    model = arrays.model
+    refiner = Refiner(hand.model, model, params, device=hand.device)
     outside = _outside(rows, hand)
     parts = []
     for first in range(0, len(rows), _BATCH_ROWS):
         part = slice(first, first + _BATCH_ROWS)
-        parts.append(_moved_part(refiner, hand, arrays, rows, part, params, bounds, stored))
+        parts.append(_moved_part(refiner, hand, arrays, rows, part, params, bounds, asked, stored))
         if progress:
             progress(min(first + _BATCH_ROWS, len(rows)))
     table = join_rows([p.table for p in parts])
@@ -89,10 +95,10 @@ def move_rows(
     was, known, taken, good, failed = (np.concatenate([p.marks[k] for p in parts]) for k in range(5))
     terms = {f"energy_{name}": values for name, values in zip(Energies._fields, last_energy, strict=True)}
     valid = was | good
-    extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": taken & _moved(rows, table, hand, obj)}
+    extra = {"energy": last_energy.sum(0), **terms, "valid": valid, "refined": taken & _moved(rows, table, hand, model)}
     extra |= {"failed_bound": np.where(valid, 0, failed)} if keep_invalid else {}
     extra = {name: np.asarray(values, np.float32) for name, values in extra.items()}
-    made = grasp_rows(press(table), hand.model.tree, obj.center, extra=extra)
+    made = grasp_rows(press(table), hand.model.tree, model.center, extra=extra)
     made = replace(made, candidate=rows.candidate, table=_ways(rows.table, made.table))
     if stored:
         made = _kept(rows, made, taken | outside | ~known, measured)
@@ -118,13 +124,14 @@ def _moved_part(
     part: slice,
     params: RefineParams,
     bounds: GraspBounds,
+    asked: Demands | None,
     stored: bool,
 ) -> _Part:
     pose, q = _hands(rows, part, hand, obj.model)
     index = np.arange(len(rows))[part]
     resting = rows.table["pose"][part] if obj.planes is not None else None
-    found = find_contacts(hand, obj, pose, q, bounds)
-    old, outcome = check_grasps(hand, obj, pose, q, found, bounds, resting=resting, index=index)
+    check = partial(check_found if asked is None else asked.check, hand, obj, bounds=bounds)
+    old, outcome = check(pose, q, resting=resting, index=index)
     given = table_pose(old, hand.device)
     was = outcome == Outcome.KEPT
     known: np.ndarray = np.zeros(len(q), bool)
@@ -133,13 +140,13 @@ def _moved_part(
             np.asarray(a)[part, 0] for a in (rows.contact_links, rows.contact_points, rows.contact_normals)
         )
         own = known_contacts(links, points - obj.model.center, normals, hand.device)
-        told, outcome = check_grasps(hand, obj, pose, q, own, _rounded(bounds), resting=resting, index=index)
+        told, outcome = check(pose, q, bounds=_rounded(bounds), contacts=own, resting=resting, index=index)
         known = outcome == Outcome.KEPT
         width = max(old.contact_links.shape[1], told.contact_links.shape[1])
         at = np.flatnonzero(known)
         old, was = choose_grasps(widen_grasps(old, width), widen_grasps(told, width), at, at), was | known
     tries = np.where(was | (params.matching_rounds == 0), 1, params.tries)
-    new, outcome = improve(refiner.search, hand, obj, pose, q, bounds, tries=tries, resting=resting, index=index)
+    new, outcome = improve(refiner.search, hand, check, pose, q, tries=tries, resting=resting, index=index)
     good = outcome == Outcome.KEPT
     lower = new.metrics["unresisted_load"] < old.metrics["unresisted_load"] - _MIN_GAIN
     taken = ~was | (good & lower)

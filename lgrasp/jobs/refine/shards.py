@@ -35,9 +35,11 @@ from lgrasp.jobs.shard_inputs import arrays_of_shard, named_hand, object_of_shar
 from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES
 from lgrasp.object.load import load_mesh
-from lgrasp.steer.touch import moved_rows
+from lgrasp.object.model import ObjectModel, SteeredObject
+from lgrasp.object.steered import steer_object, stored_weights
+from lgrasp.steer.demands import Demands
 
-VERSION = 5
+VERSION = 6
 """Raised whenever refined shards change for the same parameters."""
 
 
@@ -111,15 +113,17 @@ class RefineJob(RefineRequest, ShardJob):
                 f"{part.source}: a network planned these rows on surfaces that it guessed; here only the points of the "
                 "cloud are known, and rows that do not fit them are left out"
             )
-        told = stored_bounds(shard.header.config, part.source)
+        asked, left, config = _asked(part.source, shard, hand.model, model)
+        told = stored_bounds(config, part.source)
         bounds, params = self.numbers(told)
         begin = time.perf_counter()
         moved = move_rows(
             hand,
-            model,
+            left,
             shard.grasps,
             params,
             bounds,
+            asked=asked,
             planes=shard.objects[0].tables if shard.grasps.table else None,
             keep_invalid=self.keep_invalid,
             stored=self.form is None,
@@ -146,20 +150,14 @@ class RefineJob(RefineRequest, ShardJob):
             "refine_energy_before": moved.energy[0] * len(shard.grasps),  # sums, for merged shards
             "seconds_refine": time.perf_counter() - begin,
         }
-        config = {**shard.header.config, "bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
-        if told := config.pop("steered", None):
-            config |= (kept := moved_rows(told))
-            if kept.get("steered") != told:
-                notice("steered rows may touch elsewhere, or face another way, where they are refined")
+        config |= {"bounds": bounds.describe(), "refine": params.model_dump(mode="json")}
         index = part.shard_index
         header = replace(shard.header, config=config, created=now(), lgrasp_version=__version__, shard_index=index)
-        # contacts are found anew, wherever they are
-        objects = [replace(record, regions=None, touch_share=1.0) for record in shard.objects]
         verdicts = (name for name in shard.grasps.physics if name.endswith(("_holds", "_ok")))
         judged = tuple(f"{name.rpartition('_')[0]}_" for name in verdicts)
         told = (*judged, *(f"seconds_{name[:-1]}" for name in judged))  # of rows as they were
         statistics = {name: value for name, value in shard.statistics.items() if not name.startswith(told)}
-        refined = replace(shard, header=header, objects=objects, grasps=moved.rows, statistics=statistics)
+        refined = replace(shard, header=header, grasps=moved.rows, statistics=statistics)
         return Made(len(moved.rows), self.marked(refined, key, counts))
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
@@ -207,6 +205,26 @@ def _entry(path: Path) -> dict[str, Any]:
         "energy": float(energy.mean()) if rows else None,
         "seconds": float(statistics["seconds_refine"]),
     }
+
+
+def _asked(
+    path: Path, shard: Shard, hand: HandModel, obj: ObjectModel
+) -> tuple[Demands | None, ObjectModel | SteeredObject, dict[str, Any]]:
+    """What was asked of the rows of a shard, what of its object may be touched, and its config for moved rows.
+
+    Raises:
+        ShardError: it is asked in a form of its own.
+    """
+    config, record = dict(shard.header.config), shard.objects[0]
+    told, left = config.pop("steered", None) or {}, obj
+    if record.regions is not None:
+        left = steer_object(obj, stored_weights(obj, record.regions, record.touch_share))
+    if not told and left is obj:
+        return None, obj, config
+    asked = Demands.read(told, hand, str(path))
+    if "pose_count" in told:
+        notice(f"{path}: its rows are of given poses; refined hands leave them")
+    return asked, left, config | {"steered": {name: told[name] for name in told if name != "poses"}}
 
 
 def _check_rows(path: Path, shard: Shard) -> None:

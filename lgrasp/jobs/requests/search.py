@@ -55,11 +55,14 @@ class SearchRequest(Request):
 
     def check(self) -> None:
         check_number(self.known_parts, "shards; use larger --shard-rows or several --out")
-        for what, asked in {"place.table": self.pipeline.on_table, "steer": self.pipeline.steer.asks}.items():
-            if asked and (self.pipeline.sequence is not None or "refine" in self.pipeline.order):
-                raise ConfigError(
-                    f"pipeline '{self.pipeline.name}' with {what}: only for one object, and without stage refine"
-                )
+        steer, one = self.pipeline.steer, self.pipeline.sequence is None
+        still = one and "refine" not in self.pipeline.order  # hands stay where they are placed
+        able = {"place.table": still, "steer.above": still, "steer.pose": still, "steer": one}
+        asked = {"place.table": self.pipeline.params("place").table, "steer": steer.asks}
+        asked |= {"steer.above": steer.above, "steer.pose": steer.pose}
+        for what in (name for name in able if asked[name] and not able[name]):
+            why = "not with stage refine" if one else "only for one object"
+            raise ConfigError(f"pipeline '{self.pipeline.name}' with {what}: {why}")
         if self.pipeline.steer.above and self.pipeline.params("place").table:
             raise ConfigError(f"pipeline '{self.pipeline.name}': steer.above and place.table are one or the other")
         simulated = "simulate" in self.pipeline.order and find_protocol(self.pipeline.params("simulate").protocol)

@@ -1,8 +1,10 @@
 """refine: finished grasps -> the same, moved by a local search wherever that makes them better."""
 
+from functools import partial
+
 import numpy as np
 
-from lgrasp.grasp.find_contacts import contact_width
+from lgrasp.grasp.find_contacts import check_found, contact_width
 from lgrasp.grasp.outcomes import Outcome
 from lgrasp.grasp.tables import GraspTable, choose_grasps, widen_grasps
 from lgrasp.refine.descent import Descent
@@ -12,6 +14,7 @@ from lgrasp.refine.surface import hand_surface
 from lgrasp.refine.volume import upload_target
 from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
+from lgrasp.steer.demands import Demands
 
 VERSION = 8
 
@@ -30,8 +33,16 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     tree, hand, obj = context.hand.model.tree, context.hand, context.object
     q = np.clip(inputs.q, tree.joint_lower, tree.joint_upper)
     once = np.ones(len(inputs), int)  # rows that came are valid: there is nothing to begin again for
+    told = context.steer.told if context.steer else {}
+    check = partial(Demands.read(told, hand.model, "steer").check if told else check_found, hand, obj)
     table, outcome = improve(
-        _descent(params, context), hand, obj, inputs.pose, q, context.bounds, tries=once, index=inputs.index
+        _descent(params, context),
+        hand,
+        partial(check, bounds=context.bounds),
+        inputs.pose,
+        q,
+        tries=once,
+        index=inputs.index,
     )
     passed = outcome == Outcome.KEPT
     better = np.flatnonzero(passed & (table.metrics["unresisted_load"] < inputs.metrics["unresisted_load"]))
