@@ -289,9 +289,9 @@ class Refiner(nn.Module):
         return q.maximum(self.lower).minimum(self.upper)
 
 
-def object_pose(pose: Pose) -> np.ndarray:
+def object_pose(R: torch.Tensor, t: torch.Tensor) -> np.ndarray:
     """T_hand_object of the object's internal frame, device poses (N, 7), of hands in that frame."""
-    return pose_from_motion(*inverse_motion(pose.R, pose.t)).cpu().numpy()
+    return pose_from_motion(*inverse_motion(R, t)).cpu().numpy()
 
 
 def table_pose(table: GraspTable, device: str) -> Pose:

@@ -53,7 +53,7 @@ def test_forces_balance(checked):
 def test_a_hand_in_the_object_is_told(inputs, filtered, make, valid):
     refiner = make()
     _, n = refiner.target.nearest(refiner.middle(valid.R, valid.t))
-    pose = object_pose(valid._replace(t=valid.t - 0.006 * n))
+    pose = object_pose(valid.R, valid.t - 0.006 * n)
     table, outcome = searched(inputs, pose, filtered.q)
     deep = table.metrics["penetration"] > 0.002
     assert deep.mean() > 0.6

@@ -74,7 +74,7 @@ def test_penetration_is_left(make, valid, inputs):
     deep = refiner.max_penetration(*into) > 0.004
     assert deep.sum() > 10
     found = refiner(*(x[deep] for x in into)).pose
-    pose, q, bounds = object_pose(found), found.q.numpy(), GraspBounds()
+    pose, q, bounds = object_pose(found.R, found.t), found.q.numpy(), GraspBounds()
     contacts = find_contacts(inputs.hand, inputs.object, pose, q, bounds)
     table, _ = check_grasps(inputs.hand, inputs.object, pose, q, contacts, bounds)
     assert np.quantile(table.metrics["penetration"], 0.9) < 0.001

@@ -12,7 +12,6 @@ import numpy as np
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Made, Part, PartProgress
 from lgrasp.errors import ConfigError
-from lgrasp.geometry.rotations import inverse_motion, pose_from_motion
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.find_contacts import check_found
 from lgrasp.grasp.outcomes import Outcome
@@ -32,7 +31,7 @@ from lgrasp.learn.training import ANSWERS, Measured, Trainer, measure
 from lgrasp.object.arrays import upload_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.refine.improve import improve
-from lgrasp.refine.refiner import Refiner
+from lgrasp.refine.refiner import Refiner, object_pose
 from lgrasp.runtime.device import resolve_device
 
 ROUNDS = (3, 6, 10, 13)
@@ -179,8 +178,8 @@ def _grasps(
     hand: HandArrays, model: ObjectModel, coarse: Coarse, bounds: GraspBounds
 ) -> tuple[tuple[GraspTable, np.ndarray], tuple[GraspTable, np.ndarray]]:
     """Answers as they are, and moved by a local search, each with what the checks find (Outcome, (n,))."""
-    pose = pose_from_motion(*inverse_motion(coarse.R, coarse.t)).cpu().numpy()
-    q, obj, search = coarse.q.cpu().numpy(), upload_object(model, hand.device), refine_params(coarse=True)
+    pose, q = object_pose(coarse.R, coarse.t), coarse.q.cpu().numpy()
+    obj, search = upload_object(model, hand.device), refine_params(coarse=True)
     check = partial(check_found, hand, obj, bounds=bounds)
     descent = Refiner(hand.model, model, search, device=hand.device).search
     index, tries = np.arange(len(q)), np.full(len(q), search.tries)
