@@ -48,7 +48,7 @@ def find_crossings(
     s = row[i]
     if s < 0 or crossed_out[i] == 1:
         return
-    places = wp.min(int(packed.closing_travel[i] / _STEP), int(CLOSING_PLACES))
+    places = wp.clamp(int(packed.closing_travel[i] / _STEP), 1, int(CLOSING_PLACES))
     if place >= places:
         return
     X = wp.zeros(shape=(MAX_BODIES,), dtype=wp.transform)

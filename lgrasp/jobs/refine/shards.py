@@ -113,7 +113,7 @@ class RefineJob(RefineRequest, ShardJob):
                 f"{part.source}: a network planned these rows on surfaces that it guessed; here only the points of the "
                 "cloud are known, and rows that do not fit them are left out"
             )
-        asked, left, config = _asked(part.source, shard, hand.model, model)
+        asked, left, config = _asked(part.source, shard, hand, model)
         told = stored_bounds(config, part.source)
         bounds, params = self.numbers(told)
         begin = time.perf_counter()
@@ -208,7 +208,7 @@ def _entry(path: Path) -> dict[str, Any]:
 
 
 def _asked(
-    path: Path, shard: Shard, hand: HandModel, obj: ObjectModel
+    path: Path, shard: Shard, hand: HandArrays, obj: ObjectModel
 ) -> tuple[Demands | None, ObjectModel | SteeredObject, dict[str, Any]]:
     """What was asked of the rows of a shard, what of its object may be touched, and its config for moved rows.
 
@@ -218,10 +218,10 @@ def _asked(
     config, record = dict(shard.header.config), shard.objects[0]
     told, left = config.pop("steered", None) or {}, obj
     if record.regions is not None:
-        left = steer_object(obj, stored_weights(obj, record.regions, record.touch_share))
+        left = steer_object(obj, stored_weights(obj, record.regions, record.touch_share), device=hand.device)
     if not told and left is obj:
         return None, obj, config
-    asked = Demands.read(told, hand, str(path))
+    asked = Demands.read(told, hand.model, str(path))
     if "pose_count" in told:
         notice(f"{path}: its rows are of given poses; refined hands leave them")
     return asked, left, config | {"steered": {name: told[name] for name in told if name != "poses"}}

@@ -23,7 +23,7 @@ from lgrasp.stages.filter.posture_kernels import (
     tell_postures,
 )
 
-VERSION = 21
+VERSION = 22
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:

@@ -13,7 +13,7 @@ from lgrasp.hand.arrays import Hand, thumb_placed
 from lgrasp.math.cholesky import mat_dof, solve_dofs
 from lgrasp.math.kinematics import clamp_dofs, group_forward, point_column, vec_dof
 from lgrasp.math.limits import MAX_DOFS, MAX_JOINTS
-from lgrasp.math.sdf import sdf_below, sdf_gradient, sdf_value
+from lgrasp.math.sdf import nearer, sdf_gradient
 from lgrasp.object.arrays import Object
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.stages.wrap.touch import LinkTouch, WrapValues, contact_beside, fits, nearest_touch, touches_there
@@ -50,11 +50,12 @@ def _nearest_probe(hand: Hand, obj: Object, runs: PalmarRuns, params: WrapValues
     touch.gap = params.reach
     for k in range(runs.first[r], runs.first[r + 1]):
         p = wp.transform_point(T, runs.points[k])
-        if sdf_below(obj.sdf, p, touch.gap):
+        gap = nearer(obj.sdf, p, touch.gap)
+        if gap < touch.gap:
             e = sdf_gradient(obj.sdf, p)
             if wp.dot(wp.transform_vector(T, runs.normals[k]), wp.vec3(e[0], e[1], e[2])) < -_FACING:
                 touch.run = r
-                touch.gap = sdf_value(obj.sdf, p)
+                touch.gap = gap
                 touch.local = runs.points[k]
                 touch.out = runs.normals[k]
     return touch
