@@ -171,7 +171,7 @@ def bench_sequence(
     simulate: Annotated[
         str, Option(**one_of(ProtocolName, "PROTOCOL", "Protocol (seq6: friction 2.0, as published)."))
     ] = "seq6",
-    scale: Annotated[str, Option(help="Factor to metres, or range of the longest side [m].")] = "0.06:0.10",
+    scale: Annotated[str, Option(help="Factor to metres, or range of the longest side in metres.")] = "0.06:0.10",
     pipeline: Annotated[
         str, Option("--pipeline", "-p", help="Name of a sequence pipeline, or a YAML file.", **PIPELINE)
     ] = "sequence",

@@ -62,7 +62,7 @@ def make_objects(
         list[str] | None, Option("--kind", **one_of(ShapeKind, "KIND", "Kind of object; repeatable; default all."))
     ] = None,
     size: Annotated[
-        str | None, Option(help="Range of the longest side [m], such as 0.04:0.12; default: that of the kind.")
+        str | None, Option(help="Range of the longest side in metres, such as 0.04:0.12; default: that of the kind.")
     ] = None,
     seed: Annotated[int, Option(min=0, max=2**31 - 1, help="The same seed makes the same objects.")] = 0,
     overwrite: Annotated[bool, Option("--overwrite", help="Replace files whose contents differ.")] = False,

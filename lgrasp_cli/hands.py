@@ -233,13 +233,11 @@ def compare_hands(
 
 
 def _show_comparison(data: dict[str, Any]) -> list[Block]:
-    from lgrasp.jobs.compare.page import HAND_COLUMNS, cells, shown_columns
+    from lgrasp.jobs.compare.page import HAND_COLUMNS, cells, hand_cells, shown_columns
 
     columns = shown_columns(data["hands"])
     heads = [head for _, head, _, _ in (*columns, *HAND_COLUMNS)]
-    rows = [
-        (hand["hand"], *cells(hand["all"], columns), *cells(hand["workspace"], HAND_COLUMNS)) for hand in data["hands"]
-    ]
+    rows = [(hand["hand"], *cells(hand["all"], columns), *hand_cells(hand)) for hand in data["hands"]]
     missing = [("missing", f"{plural(data['missing'], 'hand')} with an object")] if data["missing"] else []
     table = TextTable(("hand", *heads), rows, right=heads)
     return [table, "", [*missing, ("time", f"{data['seconds']['total']:.1f} s"), ("page", str(data["page"]))]]

@@ -55,7 +55,7 @@ Settings = Annotated[
     list[str] | None, set_option(help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.")
 ]
 Viewpoint = Annotated[
-    str | None, Option(metavar="X,Y,Z", help="Position of the camera [m]; normals are turned towards it.")
+    str | None, Option(metavar="X,Y,Z", help="Position of the camera in metres; normals are turned towards it.")
 ]
 DryRun = Annotated[bool, Option("--dry-run", help="Show what would be computed, and compute nothing.")]
 Simulate = Annotated[

@@ -37,7 +37,7 @@ def plan(
     ] = None,
     starts: Annotated[int, Option("--starts", "-n", help="Points of the surface to start from.")] = 80,
     stand_off: Annotated[
-        float | None, Option(help="Distance of the hand's base from a start [m]; default: the hand's.")
+        float | None, Option(help="Distance of the hand's base from a start in metres; default: the hand's.")
     ] = None,
     distal: Annotated[float, Option(help="Weight of the palmar side of the last links.")] = 1.0,
     other: Annotated[float, Option(help="Weight of the rest of the palmar side; a small value gives pinches.")] = 0.2,

@@ -17,6 +17,24 @@ _STEPS = (
     ("simulate", "tried", "held", "grasps lose the object in the physics simulation"),
 )
 
+_LOST = {
+    "contact": "links are too far from the object where they should touch, or their surface is turned away from it "
+    "(bounds.max_gap, bounds.max_normal_angle), or too few touch",
+    "balance": "the contact forces do not balance with friction (bounds.max_gswo, bounds.friction)",
+    "unresisted load": "the contacts do not resist pulls from all directions (bounds.max_unresisted_load)",
+    "table": "the hand is in the table",
+    "approach": "the open hand has no straight way to the object above the table",
+    "touch": "too little of the normal force is on the region to touch; a smaller share or larger region gives more",
+    "squeeze": "the joints hardly press on the object, push it out, close from far away or through it, or cannot "
+    "open, a contact bears next to nothing, or epsilon is small; bounds.min_squeeze_travel=0, "
+    "bounds.min_stable_squeeze=0, bounds.min_stable_pinch=0, bounds.max_closing_travel=10, "
+    "bounds.max_closing_penetration=0.03, bounds.max_closing_sweep=1, bounds.min_pregrasp_opening=0, "
+    "bounds.min_force_share=0 and bounds.min_epsilon=0 ask for nothing",
+    "weak": "effort limits of the hand's joints leave too little force (lgrasp hands show tells them); "
+    "bounds.min_squeeze_travel=0 asks for nothing",
+}
+"""Reasons of stage filter by its counts, where more than half of the grasps are lost by one; else they collide."""
+
 
 def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
     """The stage with the smallest share of survivors, by the ``counts`` of stages, and a sentence on it."""
@@ -27,23 +45,7 @@ def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
         if not found or not whole:
             continue
         share = found.get(after, 0) / whole
-        if 2 * found.get("touch", 0) > whole:
-            reason = (
-                "too little of the normal force is on the region to touch; a smaller share or larger region gives more"
-            )
-        if 2 * found.get("squeeze", 0) > whole:
-            reason = (
-                "the joints hardly press on the object, push it out, close from far away or through it, or cannot "
-                "open, a contact bears next to nothing, or epsilon is small; bounds.min_squeeze_travel=0, "
-                "bounds.min_stable_squeeze=0, bounds.min_stable_pinch=0, bounds.max_closing_travel=10, "
-                "bounds.max_closing_penetration=0.03, bounds.max_closing_sweep=1, bounds.min_pregrasp_opening=0, "
-                "bounds.min_force_share=0 and bounds.min_epsilon=0 ask for nothing"
-            )
-        if 2 * found.get("weak", 0) > whole:
-            reason = (
-                "effort limits of the hand's joints leave too little force (lgrasp hands show tells them); "
-                "bounds.min_squeeze_travel=0 asks for nothing"
-            )
+        reason = next((words for name, words in _LOST.items() if 2 * found.get(name, 0) > whole), reason)
         if share < least:
             worst, least = stage, share
             words = f"{found.get(after, 0):,} of {whole:,} survive: {reason}"

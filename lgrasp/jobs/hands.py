@@ -89,6 +89,13 @@ def _within_reach(pipeline: Pipeline, source: HandSource, fingers: int) -> Pipel
     return pipeline.with_bounds(min_contacts=most)
 
 
+def hand_types(source: HandSource) -> dict[str, list[str]]:
+    """Grasp types that a hand makes, each with others that ask for the same contacts of it."""
+    urdf = read_urdf(source.urdf)
+    made = made_types(Anatomy(source.spec, urdf, build_tree(urdf, source.spec)))
+    return {name: list(alike) for name, alike in made.makes.items()}
+
+
 def describe_hand(name: str) -> dict[str, Any]:
     """A hand's source, rules, and joints by finger (0 is the first dependency group, None for shared joints).
 

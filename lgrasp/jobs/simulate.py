@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
+from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.reader import ShardReader, count_rows
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import PhysicsError, ShardError
-from lgrasp.grasp.records import HandRecord, ObjectRecord
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 from lgrasp.jobs.records import cutter
 from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
@@ -103,9 +104,11 @@ class SimulateJob(SimulateRequest, VerdictJob):
                 progress(kept.rows + done, note, kept=before)
 
             while (block := kept.next_block(rows, workers)) or not kept.columns:
+                some = reader.rows(kept.rows, kept.rows + block)
+                _check_rows(reader, some, kept.rows)
                 found = verdicts(
                     scene,
-                    reader.rows(kept.rows, kept.rows + block),
+                    some,
                     protocol,
                     threads=workers,
                     progress=told,
@@ -201,6 +204,14 @@ class Simulated:
     object_index: np.ndarray  # (N, O) position in them, -1 absent
     columns: dict[str, np.ndarray]  # of the protocol, without its name
     seconds: float  # 0: the shard was there already
+
+
+def _check_rows(reader: ShardReader, rows: GraspRows, first: int) -> None:
+    """Raise ShardError for rows that no simulator can be given."""
+    if problems := row_problems(rows, reader.hand(), reader.objects(), reader.column, first_row=first):
+        raise ShardError(
+            f"{reader.path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be simulated"
+        )
 
 
 def summary(done: Sequence[Simulated], protocol: Protocol) -> list[dict[str, Any]]:

@@ -66,6 +66,7 @@ def test_numbers_are_those_of_the_shards(compared):
     small, large = (hand["workspace"] for hand in data["hands"])
     assert large["manipulability"] == pytest.approx(1.1**3 * small["manipulability"], rel=1e-3)
     assert large["volume"] > small["volume"]
+    assert [len(hand["grasp_types"]) for hand in data["hands"]] == [10, 10]
 
 
 def test_page_stands_alone(compared):

@@ -32,3 +32,13 @@ def test_what_stops_a_job_is_told(small_job, tmp_path, monkeypatch):
 def test_a_stage_that_nothing_reached_is_not_blamed():
     counts = {"place": {"tried": 9, "kept": 9}, "adjust": {"tried": 5, "kept": 0}, "filter": {"kept": 0, "contact": 0}}
     assert starving_stage(counts)[0] == "adjust"
+
+
+def test_the_reason_of_most_lost_grasps_is_told():
+    for lost, words in (
+        ("contact", "bounds.max_gap"),
+        ("unresisted load", "bounds.max_unresisted_load"),
+        ("", "collide"),
+    ):
+        counts = {"filter": {"kept": 1, "object collision": 5, lost or "self-collision": 20 if lost else 3}}
+        assert words in starving_stage(counts)[1]

@@ -30,7 +30,7 @@ from lgrasp.jobs.compare.measure import measure_cell, measure_hand
 from lgrasp.jobs.compare.page import WITHOUT_ROWS, write_page
 from lgrasp.jobs.config import pair_requests
 from lgrasp.jobs.generate import GenerateJob
-from lgrasp.jobs.hands import hand_source
+from lgrasp.jobs.hands import hand_source, hand_types
 from lgrasp.jobs.metrics import HOLD, MetricsJob
 from lgrasp.jobs.requests.compare import CompareRequest, Variation, parse_variations
 from lgrasp.jobs.simulate import SimulateJob
@@ -129,7 +129,8 @@ class CompareJob(CompareRequest, Job):
 
         Returns:
             ``hands``: of each ``hand``, ``of`` (the hand that it is a variant of), ``variation``, ``workspace`` (see
-            :class:`~lgrasp.hand.workspace.Workspace`), ``objects`` (numbers by object, see
+            :class:`~lgrasp.hand.workspace.Workspace`), ``grasp_types`` that it makes, each with others that ask for
+            the same contacts, ``objects`` (numbers by object, see
             :func:`~lgrasp.jobs.compare.measure.measure_cell`) and ``all``; ``missing`` parts; ``short``: ``hand``,
             ``object`` and ``rows`` where these are fewer than asked; ``page``.
         """
@@ -149,6 +150,7 @@ class CompareJob(CompareRequest, Job):
                     "of": hand.of,
                     "variation": hand.variation and hand.variation.label,
                     "workspace": asdict(self._workspace(there[0][1])),
+                    "grasp_types": hand_types(there[0][1].keys.source),
                     "objects": objects,
                     "all": measure_hand(objects, files[hand.name]),
                 }

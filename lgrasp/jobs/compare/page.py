@@ -28,6 +28,7 @@ HAND_COLUMNS = (
     ("volume", "space [cm3]", 1e6, ",.0f"),
     ("shared", "shared [cm3]", 1e6, ",.0f"),
     ("manipulability", "manip. [cm3]", 1e6, ",.0f"),
+    ("types", "types", 1, ",.0f"),
 )
 """Numbers of a hand alone."""
 
@@ -45,6 +46,11 @@ def cells(found: Mapping[str, Any], columns: Sequence[tuple[str, str, float, str
             value = value[0]
         texts.append(number(None if value is None else factor * value, style))
     return texts
+
+
+def hand_cells(hand: Mapping[str, Any]) -> list[str]:
+    """Numbers of a hand alone as texts: HAND_COLUMNS; of grasp types those that differ in contacts."""
+    return cells({**hand["workspace"], "types": len(hand["grasp_types"])}, HAND_COLUMNS)
 
 
 def shown_columns(hands: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, float, str]]:
@@ -65,7 +71,7 @@ def write_page(data: Mapping[str, Any], files: Mapping[str, Sequence[Path]], out
     hands, columns = data["hands"], shown_columns(data["hands"])
     heads = [head for _, head, _, _ in columns]
     alone = [head for _, head, _, _ in HAND_COLUMNS]
-    rows = [[h["hand"], *cells(h["all"], columns), *cells(h["workspace"], HAND_COLUMNS)] for h in hands]
+    rows = [[h["hand"], *cells(h["all"], columns), *hand_cells(h)] for h in hands]
     words = (
         f"Pipeline {data['pipeline']}, at most {data['asked_rows']:,} grasps of each hand with each object, "
         f"on {data['device']}. Means over the objects; rows, PCA and entropy of all together; {WITHOUT_ROWS}. "
@@ -80,6 +86,10 @@ def write_page(data: Mapping[str, Any], files: Mapping[str, Sequence[Path]], out
     for name in dict.fromkeys(name for hand in hands for name in hand["objects"]):
         found = [[h["hand"], *cells(h["objects"][name], columns)] for h in hands if name in h["objects"]]
         blocks += [chapter(name), table(["hand", *heads], found)]
+    blocks += [
+        chapter("Grasp types", 2),
+        table(["hand", "types; those joined by = ask for the same contacts"], _types(hands)),
+    ]
     blocks.append(chapter("Pictures", 2))
     for hand in hands:
         drawn = (
@@ -87,3 +97,9 @@ def write_page(data: Mapping[str, Any], files: Mapping[str, Sequence[Path]], out
         )
         blocks += [chapter(hand["hand"]), *drawn]
     write_file(out, render_page(f"Hands compared: {', '.join(hand['hand'] for hand in hands)}", blocks))
+
+
+def _types(hands: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Each hand and the grasp types that it makes."""
+    made = [", ".join(" = ".join((name, *alike)) for name, alike in hand["grasp_types"].items()) for hand in hands]
+    return [[hand["hand"], types or "none"] for hand, types in zip(hands, made, strict=True)]
