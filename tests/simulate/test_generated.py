@@ -1,16 +1,20 @@
 """Verdicts of grasps that lgrasp generated."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.run import run as generate
+from lgrasp.errors import ShardError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.jobs.generate import GenerateJob
+from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.simulate.protocol import PROTOCOLS
 from lgrasp.simulate.run import verdicts
 from lgrasp.simulate.scene import Scene, scene_of
@@ -72,3 +76,15 @@ def test_planted_failures(scene, path):
     assert not verdicts(scene, replace(rows, q=rows.q_pregrasp, q_squeeze=rows.q_pregrasp), FC)["fc_holds"].any()
     slippery = FC.model_copy(update={"friction": 0.05})
     assert verdicts(scene, rows, slippery)["fc_holds"].mean() < 0.2
+
+
+@pytest.mark.parametrize(("name", "value"), [("grasps/contact_links", 99), ("grasps/q", np.nan)])
+def test_damaged_rows_are_refused(path, cache_root, tmp_path, name, value):
+    spoilt = tmp_path / "spoilt.h5"
+    shutil.copy(path, spoilt)
+    with h5py.File(spoilt, "r+") as file:
+        file[name][(3, *(0,) * (file[name].ndim - 1))] = value
+    job = SimulateJob(shards=(spoilt,), out=tmp_path / "out", protocol=FC, device="cpu", cache=Cache(cache_root))
+    with pytest.raises(ShardError, match=rf"spoilt\.h5: .*{name.partition('/')[2]}.*dataset check"):
+        generate(job)
+    assert not [*tmp_path.rglob("out/**/*.h5")]
