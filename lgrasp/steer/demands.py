@@ -61,6 +61,8 @@ class Demands:
             if facing.shape != (3,) or not np.linalg.norm(facing) > 0:
                 raise ValueError(f"facing {facing.tolist()} is no direction")
             links = some(told["links"]) if "links" in told else np.ones(len(names), bool)
+            if not links[model.contact_link].any():
+                raise ValueError("links: none that has contact surface")
             return cls(links, tuple(map(some, told.get("every", ()))), cone, facing / np.linalg.norm(facing))
         except (ConfigError, KeyError, TypeError, ValueError) as error:
             raise ShardError(f"{source}: 'steered' in its config: {error}") from error

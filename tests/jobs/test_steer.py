@@ -240,6 +240,7 @@ def test_links_that_may_not_touch_are_no_contacts(steered, refined):
     [
         ({"links": ["thumb"]}, "'thumb' is no link of hand 'allegro'"),
         ({"links": 3}, "not iterable"),
+        ({"links": []}, "none that has contact surface"),
         ({"approach": {"direction": [0, 0, 1], "angle": 20}}, "facing"),
         ({"approach": {"direction": [0, 0, 0]}, "facing": [0, 0, 1]}, "must not be zero"),
     ],

@@ -224,7 +224,8 @@ def _asked(
     asked = Demands.read(told, hand.model, str(path))
     if "pose_count" in told:
         notice(f"{path}: its rows are of given poses; refined hands leave them")
-    return asked, left, config | {"steered": {name: told[name] for name in told if name != "poses"}}
+    kept = {name: told[name] for name in told if name != "poses"}
+    return asked, left, config | ({"steered": kept} if kept else {})
 
 
 def _check_rows(path: Path, shard: Shard) -> None:
