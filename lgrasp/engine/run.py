@@ -108,8 +108,8 @@ class Job(Request, ABC):
             except (ShardError, ValueError) as error:
                 self.cache.warn(f"{part.file} is damaged ({error}); rebuilding it")
                 continue
-            if found is None:
-                continue
+            if found is None or (not found.rows and found.key != self.part_key(part)):
+                continue  # of another run that found nothing: it may be replaced
             self._check_run(part.file, found, self.part_key(part))
             if found.shard not in (-1, part.shard_index):
                 self.cache.warn(f"{part.file} holds shard {found.shard}, not {part.shard_index}; rebuilding it")
@@ -133,7 +133,7 @@ class Job(Request, ABC):
         return found_shard(part.file)
 
     def _check_run(self, path: Path, found: Found, key: str) -> None:
-        if found.key != key:
+        if found.key != key and found.rows:
             raise OutputError(self.refusal(path))
 
     def refusal(self, path: Path) -> str:

@@ -4,6 +4,7 @@ import fcntl
 import shutil
 import signal
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -13,6 +14,8 @@ from support.places import QUICK
 from support.resumed import Child
 
 from lgrasp.dataset.manifest import compare, read_manifest, workers
+from lgrasp.dataset.reader import read_shard
+from lgrasp.dataset.writer import write_shard
 from lgrasp.engine import shard as shard_module
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
@@ -147,6 +150,18 @@ def test_shard_of_another_run(run, swift, tmp_path):
     with pytest.raises(OutputError, match="another run"):  # its own shard 0 is free, the folder is not
         run(rows=10, shard_rows=10, pipeline=other)
     assert run(rows=20, shard_rows=10, pipeline=other, resume=False).made == 20
+
+
+def test_a_run_that_found_nothing_does_not_block_its_folder(run, swift, raw_grasps, tmp_path):
+    """A mistake in an option, and its correction with the same --out."""
+    (path,) = run(pipeline=swift, rows=4, out=tmp_path / "out").paths
+    shard = read_shard(path)
+    write_shard(path, replace(shard, grasps=shard.grasps.select(np.zeros(4, bool))))
+    other = {"pipeline": swift.with_seed(7), "rows": 4}
+    assert run(**other, out=tmp_path / "out").made == 4
+    run(**other, out=tmp_path / "alone")
+    assert raw_grasps(tmp_path / "out") == raw_grasps(tmp_path / "alone")
+    assert listed(tmp_path / "out") == [(path.name, 4)]
 
 
 def test_other_objects_may_share_a_folder(run, tmp_path):
