@@ -253,6 +253,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         untried = self.pipeline.params("place").policy is None and own_policy(self.pipeline, self.keys.source)
         if stage in ("search", "hold") and untried:
             words += f"; likelier poses: --set place.policy={SHIPPED}"
+        if asked := self.pipeline.steer.model_dump(exclude_defaults=True):
+            words += f"; what is asked ({', '.join(f'steer.{name}' for name in asked)}) may leave few grasps or none"
         return StarvedError(f"{few}; stage {stage} is the bottleneck: {words}")
 
 

@@ -1,5 +1,7 @@
 """What a report counts of rows as they are made, and of those in files."""
 
+from dataclasses import replace
+
 from lgrasp.engine.events import JobOutcome
 from lgrasp.engine.report import job_report
 from lgrasp.jobs.bottleneck import starving_stage
@@ -27,6 +29,11 @@ def test_what_stops_a_job_is_told(small_job, tmp_path, monkeypatch):
         said = str(job.shortfall(few))
         assert said.startswith("20 of 60 grasps found; ")
         assert words in said
+    assert "steer" not in said
+    steered = GenerateJob(**small_job | {"out": tmp_path, "pipeline": job.pipeline.with_steering(palm="no")})
+    counts = {"place": {"tried": 9, "kept": 9}, "filter": {"kept": 30, "contact": 60}}
+    monkeypatch.setattr(GenerateJob, "report", lambda *_: {"counts": counts})
+    assert "what is asked (steer.palm) may leave few" in str(steered.shortfall(replace(few, job=steered)))
 
 
 def test_a_stage_that_nothing_reached_is_not_blamed():
