@@ -51,9 +51,7 @@ JsonPath = Annotated[
 ]
 set_option = partial(Option, "--set", metavar="PART.KEY=VALUE")
 """Of commands whose parameters have other names."""
-Settings = Annotated[
-    list[str] | None, set_option(help="Set a parameter, such as bounds.friction=0.8 or search.restarts=40; repeatable.")
-]
+Settings = Annotated[list[str] | None, set_option(help="Set a parameter, such as bounds.friction=0.8; repeatable.")]
 Viewpoint = Annotated[
     str | None, Option(metavar="X,Y,Z", help="Position of the camera in metres; normals are turned towards it.")
 ]

@@ -19,7 +19,7 @@ from lgrasp.stages.filter.stage import allowed_runs
 from lgrasp.stages.wrap.params import WrapParams
 from lgrasp.stages.wrap.stage import wrap_values
 
-VERSION = 3
+VERSION = 4
 
 _REACH = 0.01  # [m] of links from the object where a finger meets it: others are not those that meet it
 

@@ -21,7 +21,7 @@ from lgrasp.stages.wrap.kernels import WrapCount, list_realised, wrap_fingers
 from lgrasp.stages.wrap.params import WrapParams
 from lgrasp.stages.wrap.touch import WrapValues
 
-VERSION = 2
+VERSION = 3
 
 _PROBES = 24  # points of a link from which its nearest one is looked for
 _NORMAL_MARGIN = 2.0  # [deg] below the bound of the normals
