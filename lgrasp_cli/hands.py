@@ -62,7 +62,7 @@ def show_hand(name: HandArgument) -> Answer:
 
     Example: lgrasp hands show allegro
     """
-    from lgrasp.jobs.hands import describe_hand
+    from lgrasp.jobs.hands import describe_hand, types_text
 
     hand = describe_hand(name)
     box = " to ".join(" ".join(f"{1000 * x:.0f}" for x in hand["canonical_box"][end]) for end in ("min", "max"))
@@ -78,7 +78,7 @@ def show_hand(name: HandArgument) -> Answer:
         *(("shared joint", f"{n}: {', '.join(f'{x:g}' for x in v)}") for n, v in hand["shared"].items()),
         ("canonical box", f"{box} mm"),
         ("opposition spaces", f"{len(spaces)}: {', '.join(spaces)}" if spaces else "none"),
-        ("grasp types", "; ".join(" = ".join((name, *others)) for name, others in types["makes"].items()) or "none"),
+        ("grasp types", types_text(types["makes"])),
         *(("not made", f"{', '.join(names)}: {why}") for why, names in _unmade(types["cannot"]).items()),
         ("licence", hand["licence"] or "not stated"),
         ("source", hand["source"] or "not stated"),

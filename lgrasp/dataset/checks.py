@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lgrasp.errors import HandError
+from lgrasp.errors import HandError, ShardError
 from lgrasp.grasp.hand_files import lacks
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord, SequenceRows
 from lgrasp.grasp.schema import CHUNK_ROWS
@@ -136,6 +136,21 @@ def row_problems(
             _check_steps(rows, rows.sequence, *limits, require)
             _check_parents(rows, rows.sequence, column, first_row, require)
     return problems
+
+
+def refuse_problems(
+    path: Path,
+    rows: GraspRows,
+    hand: HandRecord,
+    objects: Sequence[ObjectRecord],
+    column: Column,
+    use: str,
+    *,
+    first_row: int = 0,
+) -> None:
+    """Raise ShardError if some rows of a file have :func:`row_problems`; ``use``: what cannot be done with them."""
+    if problems := row_problems(rows, hand, objects, column, first_row=first_row):
+        raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be {use}")
 
 
 def _check_poses(rows: GraspRows, objects: int, require: Require) -> None:

@@ -98,7 +98,7 @@ class Job(Request, ABC):
         # one of the others is enough: whoever wrote into the folder looked as well
         for path in neighbours([part.file for part in parts])[:1] if self.one_key else ():
             with suppress(ShardError, ValueError):
-                self._check_run(path, found_shard(path), self.key())
+                self._is_own(path, found_shard(path), self.key())
         present = {}
         for part in parts:
             if not os.path.lexists(part.file):
@@ -108,9 +108,8 @@ class Job(Request, ABC):
             except (ShardError, ValueError) as error:
                 self.cache.warn(f"{part.file} is damaged ({error}); rebuilding it")
                 continue
-            if found is None or (not found.rows and found.key != self.part_key(part)):
-                continue  # of another run that found nothing: it may be replaced
-            self._check_run(part.file, found, self.part_key(part))
+            if found is None or not self._is_own(part.file, found, self.part_key(part)):
+                continue
             if found.shard not in (-1, part.shard_index):
                 self.cache.warn(f"{part.file} holds shard {found.shard}, not {part.shard_index}; rebuilding it")
                 continue
@@ -132,9 +131,12 @@ class Job(Request, ABC):
             raise ShardError(problems[0])
         return found_shard(part.file)
 
-    def _check_run(self, path: Path, found: Found, key: str) -> None:
+    def _is_own(self, path: Path, found: Found, key: str) -> bool:
+        """Whether a file is of this run. One of another that found nothing may be replaced, one with rows stays: an
+        OutputError."""
         if found.key != key and found.rows:
             raise OutputError(self.refusal(path))
+        return found.key == key
 
     def refusal(self, path: Path) -> str:
         """Why a file of another run stays."""

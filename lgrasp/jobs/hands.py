@@ -1,6 +1,7 @@
 """A hand by name, with rules drafted for those of installed packages, and its description."""
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,11 @@ def hand_types(source: HandSource) -> dict[str, list[str]]:
     urdf = read_urdf(source.urdf)
     made = made_types(Anatomy(source.spec, urdf, build_tree(urdf, source.spec)))
     return {name: list(alike) for name, alike in made.makes.items()}
+
+
+def types_text(makes: Mapping[str, Sequence[str]]) -> str:
+    """Grasp types of a hand in one line, those that ask for the same contacts joined by ``=``."""
+    return "; ".join(" = ".join((name, *alike)) for name, alike in makes.items()) or "none"
 
 
 def describe_hand(name: str) -> dict[str, Any]:

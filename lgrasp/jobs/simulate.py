@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
-from lgrasp.dataset.checks import row_problems
+from lgrasp.dataset.checks import refuse_problems
 from lgrasp.dataset.reader import ShardReader, count_rows
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import rows_digest
 from lgrasp.errors import PhysicsError, ShardError
-from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
+from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.jobs.records import cutter
 from lgrasp.jobs.requests.shards import SimulateRequest
 from lgrasp.jobs.shard_inputs import mesh_hash
@@ -93,7 +93,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         protocol, device, name = self.protocol, self.device_used.alias, self.protocol.name
         workers = threads(self.workers)
         with ShardReader(part.source) as reader:
-            scene, rows = self._scene_of(reader.hand(), reader.objects(), progress), len(reader)
+            hand, objects, rows = reader.hand(), reader.objects(), len(reader)
+            scene = self._scene_of(hand, objects, progress)
             key = self.key_of(reader)
             kept = KeptVerdicts(self.cache, key, name, largest=_GPU_BLOCK if self._kind() == "gpu" else None)
 
@@ -105,7 +106,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
 
             while (block := kept.next_block(rows, workers)) or not kept.columns:
                 some = reader.rows(kept.rows, kept.rows + block)
-                _check_rows(reader, some, kept.rows)
+                refuse_problems(part.source, some, hand, objects, reader.column, "simulated", first_row=kept.rows)
                 found = verdicts(
                     scene,
                     some,
@@ -204,14 +205,6 @@ class Simulated:
     object_index: np.ndarray  # (N, O) position in them, -1 absent
     columns: dict[str, np.ndarray]  # of the protocol, without its name
     seconds: float  # 0: the shard was there already
-
-
-def _check_rows(reader: ShardReader, rows: GraspRows, first: int) -> None:
-    """Raise ShardError for rows that no simulator can be given."""
-    if problems := row_problems(rows, reader.hand(), reader.objects(), reader.column, first_row=first):
-        raise ShardError(
-            f"{reader.path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be simulated"
-        )
 
 
 def summary(done: Sequence[Simulated], protocol: Protocol) -> list[dict[str, Any]]:

@@ -121,6 +121,17 @@ class SurfaceWeights:
         avoid = np.zeros(n) if self.avoid is None else self.avoid
         return np.column_stack([self.points, touch, avoid]).astype(np.float32)
 
+    def near(self, points: np.ndarray) -> np.ndarray:
+        """Of other points of the surface (k, 3) those of the nearest: in what to touch, in what to avoid, (k, 2)."""
+        tree, weights = self._known
+        return weights[tree.query(points)[1]]
+
+    @cached_property
+    def _known(self) -> tuple[Any, np.ndarray]:
+        from scipy.spatial import cKDTree  # slow to load
+
+        return cKDTree(self.points), self.table()[:, 3:]
+
 
 @dataclass(frozen=True)
 class SteeredObject:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lgrasp.errors import ConfigError
 from lgrasp.geometry.shares import entries_of
@@ -39,7 +38,7 @@ def surface_weights(
 def stored_weights(model: ObjectModel, regions: np.ndarray, share: float) -> SurfaceWeights:
     """What a shard says of regions (:meth:`SurfaceWeights.table`, (S, 5)), for contact points of the same object."""
     points = (model.contact_points + model.center).astype(np.float32)
-    touch, avoid = regions[cKDTree(regions[:, :3]).query(points)[1], 3:].T
+    touch, avoid = SurfaceWeights(regions[:, :3], regions[:, 3], regions[:, 4], share).near(points).T
     return SurfaceWeights(points, touch, avoid, share)
 
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lgrasp.config import parse_model
 from lgrasp.errors import ConfigError, ShardError
@@ -109,13 +108,11 @@ class Demands:
 def _on_regions(table: GraspTable, obj: ObjectArrays) -> np.ndarray:
     """Rows whose contacts are where they may be, with as much of the normal force as must be there, (n,) bool."""
     assert obj.steered is not None
-    weights = obj.steered.weights
-    used = table.contact_links >= 0
-    _points, touch, avoid = np.split(weights.table(), (3, 4), axis=1)
+    used, share = table.contact_links >= 0, obj.steered.weights.share
+    near = obj.steered.weights.near(table.contact_points[used] + obj.model.center)
     on, off = np.zeros(used.shape, bool), np.zeros(used.shape, bool)
-    nearest = cKDTree(weights.points).query(table.contact_points[used] + obj.model.center)[1]
-    on[used], off[used] = touch[nearest, 0] >= MEMBER, avoid[nearest, 0] >= MEMBER
-    if weights.share == 1.0:
+    on[used], off[used] = (near >= MEMBER).T
+    if share == 1.0:
         return ~(off | (used & ~on)).any(1)
     push = np.where(used, -(table.contact_forces * table.contact_normals).sum(-1), 0.0)
-    return ~off.any(1) & ((push * on).sum(1) >= (weights.share - _SHARE_ROUNDING) * push.sum(1))
+    return ~off.any(1) & ((push * on).sum(1) >= (share - _SHARE_ROUNDING) * push.sum(1))

@@ -1,7 +1,10 @@
 """docs/reference/cli.md says what the commands say."""
 
+import typer
 from support.cli_page import cli_page
 from support.places import ROOT
+
+from lgrasp_cli.main import app
 
 PAGE = ROOT / "docs" / "reference" / "cli.md"
 
@@ -17,3 +20,15 @@ def test_page_names_commands_options_and_keys():
     assert "## lgrasp dataset merge\n" in page
     assert "- `-n, --rows`: " in page
     assert "- `object_dir`: " in page
+
+
+def test_no_help_has_brackets():
+    """In a terminal what is in them is taken for a style and not shown: units were lost."""
+
+    def texts(command):
+        yield from (option.help for option in command.params if getattr(option, "help", None))
+        yield command.help or ""
+        for below in getattr(command, "commands", {}).values():
+            yield from texts(below)
+
+    assert [text for text in texts(typer.main.get_command(app)) if "[" in text] == []

@@ -9,6 +9,7 @@ from lgrasp.dataset.report.tables import Block, table
 from lgrasp.dataset.report.write import pictures
 from lgrasp.files import write_file
 from lgrasp.jobs.compare.measure import MEANS
+from lgrasp.jobs.hands import types_text
 from lgrasp.words import number
 
 COLUMNS = (  # number, head, factor, format
@@ -88,7 +89,10 @@ def write_page(data: Mapping[str, Any], files: Mapping[str, Sequence[Path]], out
         blocks += [chapter(name), table(["hand", *heads], found)]
     blocks += [
         chapter("Grasp types", 2),
-        table(["hand", "types; those joined by = ask for the same contacts"], _types(hands)),
+        table(
+            ["hand", "types; those joined by = ask for the same contacts"],
+            [[hand["hand"], types_text(hand["grasp_types"])] for hand in hands],
+        ),
     ]
     blocks.append(chapter("Pictures", 2))
     for hand in hands:
@@ -97,9 +101,3 @@ def write_page(data: Mapping[str, Any], files: Mapping[str, Sequence[Path]], out
         )
         blocks += [chapter(hand["hand"]), *drawn]
     write_file(out, render_page(f"Hands compared: {', '.join(hand['hand'] for hand in hands)}", blocks))
-
-
-def _types(hands: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Each hand and the grasp types that it makes."""
-    made = [", ".join(" = ".join((name, *alike)) for name, alike in hand["grasp_types"].items()) for hand in hands]
-    return [[hand["hand"], types or "none"] for hand, types in zip(hands, made, strict=True)]

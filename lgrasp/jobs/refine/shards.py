@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from lgrasp import __version__
-from lgrasp.dataset.checks import row_problems
+from lgrasp.dataset.checks import refuse_problems
 from lgrasp.dataset.exports.formats import read_grasps
 from lgrasp.dataset.exports.reading import objects_beside
 from lgrasp.dataset.info import closure_share
@@ -233,9 +233,8 @@ def _check_rows(path: Path, shard: Shard) -> None:
     rows, hand = shard.grasps, shard.hand
     q = np.where(np.isfinite(rows.q), np.clip(rows.q, hand.joint_lower, hand.joint_upper), rows.q)
     columns = rows.columns()
-    problems = row_problems(replace(rows, q=q), hand, shard.objects, lambda name, first, end: columns[name][first:end])
-    if problems:
-        raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be refined")
+    given = replace(rows, q=q), hand, shard.objects, lambda name, first, end: columns[name][first:end]
+    refuse_problems(path, *given, "refined")
 
 
 def _grasp_shards(path: Path, form: str, source: HandSource, hand: HandModel) -> Iterator[Shard]:

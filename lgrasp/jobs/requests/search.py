@@ -55,13 +55,14 @@ class SearchRequest(Request):
 
     def check(self) -> None:
         check_number(self.known_parts, "shards; use larger --shard-rows or several --out")
-        steer, one = self.pipeline.steer, self.pipeline.sequence is None
-        still = one and "refine" not in self.pipeline.order  # hands stay where they are placed
-        able = {"place.table": still, "steer.above": still, "steer.pose": still, "steer": one}
-        asked = {"place.table": self.pipeline.params("place").table, "steer": steer.asks}
-        asked |= {"steer.above": steer.above, "steer.pose": steer.pose}
-        for what in (name for name in able if asked[name] and not able[name]):
-            why = "not with stage refine" if one else "only for one object"
+        steer, refused, why = self.pipeline.steer, {}, ""
+        placed = {"place.table": self.pipeline.params("place").table, "steer.above": steer.above}
+        placed |= {"steer.pose": steer.pose}
+        if self.pipeline.sequence is not None:
+            refused, why = placed | {"steer": steer.asks}, "only for one object"
+        elif "refine" in self.pipeline.order:
+            refused, why = placed, "not with stage refine"  # which moves hands from where they are placed
+        for what in (name for name, asked in refused.items() if asked):
             raise ConfigError(f"pipeline '{self.pipeline.name}' with {what}: {why}")
         if self.pipeline.steer.above and self.pipeline.params("place").table:
             raise ConfigError(f"pipeline '{self.pipeline.name}': steer.above and place.table are one or the other")

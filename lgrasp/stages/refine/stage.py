@@ -34,11 +34,11 @@ def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[Gra
     q = np.clip(inputs.q, tree.joint_lower, tree.joint_upper)
     once = np.ones(len(inputs), int)  # rows that came are valid: there is nothing to begin again for
     told = context.steer.told if context.steer else {}
-    check = partial(Demands.read(told, hand.model, "steer").check if told else check_found, hand, obj)
+    check = Demands.read(told, hand.model, "steer").check if told else check_found
     table, outcome = improve(
         _descent(params, context),
         hand,
-        partial(check, bounds=context.bounds),
+        partial(check, hand, obj, bounds=context.bounds),
         inputs.pose,
         q,
         tries=once,
