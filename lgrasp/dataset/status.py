@@ -89,13 +89,13 @@ def _state(folder: Path, run: ListedRun, found: Differences, working: Any) -> di
     else:
         starved = any(shard.asked is not None and (shard.rows or 0) < shard.asked for shard in there)
         state = "starved" if starved else "complete"
-    # fewer may have been asked for since
-    asked = [max(shard.asked, shard.rows or 0) for shard in run.shards if shard.asked is not None]
+    # fewer may have been asked for since, of some shards none
+    asked = sum(max(shard.asked or 0, shard.rows or 0) for shard in run.shards)
     return {
         "folder": str(folder),
         **run.model_dump(exclude={"shards"}),
         "rows": sum(shard.rows or 0 for shard in there),
-        "asked": sum(asked) if asked else None,
+        "asked": asked if any(shard.asked is not None for shard in run.shards) else None,
         "shards": sum(shard.written for shard in there),
         "listed": len(run.shards),
         "missing": sorted(missing),

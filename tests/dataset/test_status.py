@@ -68,6 +68,13 @@ def test_states(tmp_path):
     assert (cut["rows"], cut["asked"], cut["shards"], cut["listed"], cut["state"]) == (2, 6, 1, 3, "incomplete")
 
 
+def test_rows_of_shards_that_are_not_asked_for_any_more_count_as_asked(tmp_path):
+    run(SampleJob(out=tmp_path))
+    run(SampleJob(out=tmp_path, rows=2))
+    ((_, run_, rows, shards, state),) = table(tmp_path)
+    assert (run_, rows, shards, state) == ("sample toy cup seed 0", "6 of 6", "3 of 3", "complete")
+
+
 def test_verify_reads_the_files(tmp_path):
     run(SampleJob(out=tmp_path))
     path = tmp_path / "toy-cup-00001.h5"
