@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import warp as wp
 
 from lgrasp.geometry.poses import internal_poses
 from lgrasp.grasp.bounds import GraspBounds
@@ -28,7 +29,8 @@ from lgrasp.stages.refine.params import RefineParams
 from lgrasp.steer.demands import Demands
 
 _BATCH_ROWS = 256  # at a time
-_GPU_BATCH_ROWS = 4096  # the same on a GPU: 2.5 GB for a hand of five fingers
+_GPU_BATCH_ROWS = 4096  # the most at a time on a GPU
+_ROW_BYTES = 1 << 20  # that a row may need at a time; hands of five fingers need 0.6 MB
 _MAX_OBJECT_DISTANCE = 0.5  # [m] from the object: nothing pulls there
 _MIN_GAIN = 1e-3  # of a unit pull that must be resisted more to replace a valid row
 _POSE_ROUNDING = 1e-6  # [m] of a pose in a file
@@ -86,7 +88,7 @@ def move_rows(
     refiner = Refiner(hand.model, model, params, device=hand.device)
     outside = _outside(rows, hand)
     parts = []
-    size = _BATCH_ROWS if hand.device == "cpu" else _GPU_BATCH_ROWS
+    size = _batch_rows(hand.device)
     for first in range(0, len(rows), size):
         part = slice(first, first + size)
         parts.append(_moved_part(refiner, hand, arrays, rows, part, params, bounds, asked, stored))
@@ -109,6 +111,13 @@ def move_rows(
     means = float(first_energy.sum(0).mean()), float(last_energy.sum(0).mean())
     far, lost = sum(p.far for p in parts), int((~valid).sum())
     return Moved(made, means, (int(was.sum()), int(valid.sum())), lost, int(outside.sum()), far)
+
+
+def _batch_rows(device: str) -> int:
+    """How many rows are moved at a time: on a GPU more, as many as have place there."""
+    if device == "cpu":
+        return _BATCH_ROWS
+    return int(np.clip(wp.get_device(device).free_memory // _ROW_BYTES, _BATCH_ROWS, _GPU_BATCH_ROWS))
 
 
 class _Part(NamedTuple):
