@@ -145,7 +145,7 @@ return true;
 """)
 def _skips() -> wp.bool:
     """Whether look-ups are skipped where a loop of points keeps the least distance: not on a GPU, where it is no
-    faster, and where the assembler of CUDA 13.4, at its highest level, makes a loop of it that finds nothing."""
+    faster, and where such loops, compiled by CUDA 13.4 at its highest level, found nothing."""
 
 
 @wp.func

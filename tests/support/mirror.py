@@ -10,6 +10,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import pytest
@@ -38,9 +39,9 @@ class Mirror:
         self.found: dict[str, list[int]] = {}  # of kernel and argument: numbers that differ, that were written
         self.failed: dict[str, str] = {}
         self._tries: Counter[Any] = Counter()
-        self._owners: dict[int, Any] = {}  # meshes and trees by handle
-        self._twins: dict[int, Any] = {}
-        self._objects: dict[int, StructInstance] = {}  # that arrays of structs hold, by where their points are
+        self._owners: WeakValueDictionary[int, Any] = WeakValueDictionary()  # meshes and trees by handle
+        self._twins: dict[int, tuple[Any, Any]] = {}  # with their owners: no other one has the handle then
+        self._objects: WeakValueDictionary[int, StructInstance] = WeakValueDictionary()  # by where their points are
 
     def note_handle(self, owner: Any) -> None:
         self._owners[int(owner.id)] = owner
@@ -58,10 +59,12 @@ class Mirror:
             twin = _Twin(self)
             try:
                 own = [twin.of(value, label) for value, label in zip(given, labels, strict=True)]
-                made = _launch(kernel, dim, inputs, outputs, **more)
             except LookupError as error:
                 self.failed[name] = str(error)
-                return _launch(kernel, dim, inputs, outputs, **more)
+                own = None
+            made = _launch(kernel, dim, inputs, outputs, **more)
+            if own is None:
+                return made
             sizes = (dim,) if isinstance(dim, int) else tuple(dim)
             options = {key: value for key, value in more.items() if key not in ("device", "stream")}
             _launch(kernel, (*sizes[:-1], twin.lanes or sizes[-1]), own, [], device=self.device, **options)
@@ -83,7 +86,7 @@ class Mirror:
     def compare(self, name: str, before: np.ndarray, cpu: np.ndarray, gpu: np.ndarray) -> None:
         """Add up how much two ends of one argument differ."""
         sums = self.found.setdefault(name, [0, 0])
-        for old, a, b in zip(_numbers(before), _numbers(cpu), _numbers(gpu), strict=True):
+        for old, a, b in zip(_leaves(before), _leaves(cpu), _leaves(gpu), strict=True):
             near = {"rtol": 1e-3, "atol": 1e-5} if a.dtype.kind == "f" else {"rtol": 0, "atol": 0}
             sums[0] += int((~np.isclose(a, b, equal_nan=True, **near)).sum())
             sums[1] += int(((a != old) | (b != old)).sum())
@@ -96,8 +99,8 @@ class Mirror:
             own = self._owners[number]
             parts = (own.points, own.indices) if isinstance(own, wp.Mesh) else (own.lowers, own.uppers)
             more = {"support_winding_number": True} if isinstance(own, wp.Mesh) else {}
-            self._twins[number] = type(own)(*(wp.clone(part, device=self.device) for part in parts), **more)
-        return int(self._twins[number].id) if number else 0
+            self._twins[number] = own, type(own)(*(wp.clone(part, device=self.device) for part in parts), **more)
+        return int(self._twins[number][1].id) if number else 0
 
     def objects(self, rows: np.ndarray) -> list[StructInstance]:
         """Structs of arrays, on the other device."""
@@ -165,9 +168,9 @@ def _bytes(values: list[Any]) -> int:
     return sum(x if isinstance(x, int) else x.capacity for x in sizes if isinstance(x, (int, wp.array)))
 
 
-def _numbers(values: np.ndarray) -> Iterator[np.ndarray]:
+def _leaves(values: np.ndarray) -> Iterator[np.ndarray]:
     for name in values.dtype.names or ():
-        yield from _numbers(values[name])
+        yield from _leaves(values[name])
     if values.dtype.names is None:
         yield values
 
