@@ -73,6 +73,19 @@ def _clamped(s: Sdf, x: wp.vec3):
 
 
 @wp.func
+def beyond(x: wp.vec3, c: wp.vec3):
+    """x - c, how far grid coordinates x are beyond the grid whose nearest point is c: exactly 0 within it.
+
+    Equal coordinates are compared, as a compiler may round product and difference at once: x - c is not 0 then.
+    """
+    return wp.vec3(
+        wp.where(x[0] == c[0], 0.0, x[0] - c[0]),
+        wp.where(x[1] == c[1], 0.0, x[1] - c[1]),
+        wp.where(x[2] == c[2], 0.0, x[2] - c[2]),
+    )
+
+
+@wp.func
 def _edges(s: Sdf, c: wp.vec3):
     """Of the cell at grid coordinates c: values on its four edges along z at c's height, their rises [m], and where in
     the cell c lies.
@@ -107,7 +120,7 @@ def sdf_value(s: Sdf, p: wp.vec3):
     v, _rise, f = _edges(s, c)
     ends = _along_y(v, f[1])
     d = ends[0] + (ends[1] - ends[0]) * f[0]
-    o = x - c
+    o = beyond(x, c)
     o2 = o[0] * o[0] + o[1] * o[1] + o[2] * o[2]
     if o2 > 0.0:
         # the surface is inside the grid, so it is no nearer than this
@@ -136,22 +149,10 @@ def sdf_below(s: Sdf, p: wp.vec3, limit: wp.float32):
     return sdf_value(s, p) < limit
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return false;
-#else
-return true;
-#endif
-""")
-def _skips() -> wp.bool:
-    """Whether look-ups are skipped where a loop of points keeps the least distance: not on a GPU, where it is no
-    faster, and where such loops, compiled by CUDA 13.4 at its highest level, found nothing."""
-
-
 @wp.func
 def nearer(s: Sdf, p: wp.vec3, least: wp.float32):
     """The smaller of ``least`` and the signed distance at p [m]."""
-    if _skips() and sdf_far(s, p, least):
+    if sdf_far(s, p, least):
         return least
     return wp.min(least, sdf_value(s, p))
 
@@ -159,7 +160,7 @@ def nearer(s: Sdf, p: wp.vec3, least: wp.float32):
 @wp.func
 def deeper(s: Sdf, p: wp.vec3, depth: wp.float32):
     """The larger of ``depth`` and the depth of p [m]."""
-    if _skips() and sdf_far(s, p, -depth):
+    if sdf_far(s, p, -depth):
         return depth
     return wp.max(depth, -sdf_value(s, p))
 
@@ -178,7 +179,7 @@ def sdf_gradient(s: Sdf, p: wp.vec3):
     n = wp.length(g)
     if n > 1.0e-12:
         g = g / n
-    o = (x - c) / s.inv_cell
+    o = beyond(x, c) / s.inv_cell
     if wp.length(o) > 0.0:
         # beyond the grid: the surface seen from the clamped point
         e = o + g * d

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from lgrasp.geometry.clusters import evenly
+from lgrasp.math.sdf import beyond
 from lgrasp.object.model import ObjectModel
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.structs import upload_struct
@@ -93,7 +94,7 @@ def _cell_of(v: Volume, p: wp.vec3):
     s = _Cell()
     s.first = (i * v.ny + j) * v.nz + k
     s.share = wp.vec3(c[0] - float(i), c[1] - float(j), c[2] - float(k))
-    s.beyond = (x - c) * v.cell
+    s.beyond = beyond(x, c) * v.cell
     return s
 
 

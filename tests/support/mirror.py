@@ -25,7 +25,7 @@ from lgrasp.runtime.kernels import import_all
 MOST = 0.02
 TRIES, TRIES_OF_A_TEST = 6, 2
 MOST_BYTES = 1 << 30
-NOT_MIRRORED = {"grid"}  # arguments: handles of hash grids
+NOT_MIRRORED = {"grid", "dots"}  # arguments: handles of hash grids; of pictures, which only a CPU draws
 
 _launch = wp.launch
 _lock = threading.RLock()
@@ -100,7 +100,13 @@ class Mirror:
             parts = (own.points, own.indices) if isinstance(own, wp.Mesh) else (own.lowers, own.uppers)
             more = {"support_winding_number": True} if isinstance(own, wp.Mesh) else {}
             self._twins[number] = own, type(own)(*(wp.clone(part, device=self.device) for part in parts), **more)
-        return int(self._twins[number][1].id) if number else 0
+        if not number:
+            return 0
+        own, twin = self._twins[number]
+        if isinstance(own, wp.Mesh):  # its points may have moved
+            wp.copy(twin.points, own.points)
+            twin.refit()
+        return int(twin.id)
 
     def objects(self, rows: np.ndarray) -> list[StructInstance]:
         """Structs of arrays, on the other device."""
@@ -123,6 +129,7 @@ class _Twin:
         self.mirror, self.lanes = mirror, 0
         self.pairs: list[tuple[str, wp.array, np.ndarray, wp.array]] = []
         self._made: dict[Any, wp.array] = {}
+        self._kept: list[StructInstance] = []  # an array of structs does not keep their arrays
 
     def of(self, value: Any, label: str) -> Any:
         if isinstance(value, StructInstance):
@@ -157,7 +164,9 @@ class _Twin:
             handles = [self.mirror.handle(int(number)) for number in numbers]
             return wp.array(np.array(handles, np.uint64), dtype=wp.uint64, device=device)
         if isinstance(value.dtype, Struct) and any(isinstance(v.type, wp.array) for v in value.dtype.vars.values()):
-            return wp.array(self.mirror.objects(numbers), dtype=value.dtype, device=device)
+            structs = self.mirror.objects(numbers)
+            self._kept += structs
+            return wp.array(structs, dtype=value.dtype, device=device)
         twin = wp.array(np.ascontiguousarray(numbers), dtype=value.dtype, shape=value.shape, device=device)
         self.pairs.append((label, value, numbers, twin))
         return twin
