@@ -58,6 +58,8 @@ def _balanced(
 def balance_grasps(limits: Limits, places: Places, at: CheckedPostures, found_out: Findings):
     """FSWO (eq. 1), GSWO (eq. 2, pyramids) and its forces, object frame."""
     i = wp.tid()
+    if limits.whole == 1:  # which of several deep places ends the look is chance on a GPU
+        found_out.penetration[i] = wp.min(found_out.penetration[i], limits.deepest)
     if found_out.outcome[i] == Outcome.KEPT and found_out.penetration[i] > limits.max_penetration:
         found_out.outcome[i] = Outcome.OBJECT_COLLISION
     if found_out.outcome[i] != Outcome.KEPT and limits.whole == 0:

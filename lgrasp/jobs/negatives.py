@@ -12,6 +12,7 @@ from lgrasp.engine.shard import shard_context, shard_effort
 from lgrasp.grasp.bounds import ANY_CLOSING, ANY_PENETRATION, ANY_SWEEP
 from lgrasp.grasp.row_order import RowOrder
 from lgrasp.grasp.tables import GraspTable, join_rows, take_rows, widen_grasps
+from lgrasp.runtime.kept import Keeper
 from lgrasp.stages.filter.failed import failed_rows
 
 _PER_POSE = 2
@@ -67,7 +68,8 @@ def _marked(table: GraspTable, like: GraspTable | None = None, **metrics: np.nda
 def _failed(pipeline: Pipeline, inputs: Inputs, shard: int, count: int) -> GraspTable:
     """Failed rows of the first candidates of a shard that have so many, in random order."""
     bounds, loose = pipeline.bounds, _loosened(pipeline)
-    context, block = shard_context(loose, inputs, shard), block_size(pipeline)
+    own = replace(inputs, kept=inputs.kept.get("negatives", "", Keeper))  # a GPU replays what was kept for grasps
+    context, block = shard_context(loose, own, shard), block_size(pipeline)
     last = pipeline.order[pipeline.order.index("filter") - 1]
     parts, rows = [], 0
     for first in range(0, shard_effort(pipeline, count), block):
