@@ -105,8 +105,9 @@ def verdicts(
     :data:`lgrasp.simulate.DRAWN_COLUMNS` where it has draws; of a protocol with a lift, those of
     :data:`lgrasp.simulate.verdict.LIFT_COLUMNS`.
 
-    A verdict depends on its row only, not on the number of threads or the other rows; a row sees the objects that it
-    has and no others of the scene.
+    A verdict depends on its row only, not on the number of threads or the other rows; on a GPU, where sums are added up
+    in any order, one near a limit may differ from run to run. A row sees the objects that it has and no others of the
+    scene.
 
     Args:
         rows: N grasps of O objects at most; K columns of q and contacts as in a shard.
