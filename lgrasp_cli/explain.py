@@ -23,7 +23,7 @@ def explain(error: BaseException) -> tuple[str, int]:
     if isinstance(error, SystemExit):
         return "", error.code if isinstance(error.code, int) else 1
     if isinstance(error, MemoryError) or "out of memory" in str(error).lower():
-        return "error: out of memory; lower --workers or --batch, or choose fewer --shard-rows", 2
+        return "error: out of memory; lower --workers, or --batch or --shard-rows if the command has them", 2
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
         return f"error: {where}{error.strerror}", 2
