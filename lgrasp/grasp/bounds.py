@@ -204,6 +204,19 @@ class GraspBounds(Params):
             return metrics["hold_probability"] >= 0
         return (metrics["hold_success"] > 0) & (metrics["hold_probability"] >= self.min_hold_probability - 1e-6)
 
+    @property
+    def told(self) -> str:
+        """By what rows are valid: the profile, and the numbers that allow more than it does."""
+        usual = GraspBounds(profile=self.profile)
+
+        def looser(name: str) -> bool:
+            own, strict = getattr(self, name), getattr(usual, name)
+            return own < strict if name.startswith("min_") else own > strict
+
+        bounded = (n for n in type(self).model_fields if n.startswith(("max_", "min_")) or n == "friction")
+        names = [name for name in bounded if looser(name)]
+        return f"{self.profile}, but for {', '.join(names)}" if names else self.profile
+
     def describe(self) -> dict[str, Any]:
         """As shards store them: the profile, and every number."""
         return {"profile": self.profile, "numbers": self.model_dump(mode="json", exclude={"profile"})}

@@ -183,7 +183,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         """The results in numbers; rates are those of the shards that this call made.
 
         Returns:
-            ``grasps``, ``strict`` (those within the strict bounds) and ``profile`` (of the bounds that all are within);
+            ``grasps``, ``strict`` (those within the strict bounds) and ``profile`` (by which all are valid, and the
+            bounds that are looser than it);
             ``grasps_per_s``, ``strict_valid_per_s``, ``published_count_per_s`` (over the wall time of placement through
             filter), ``seconds`` (thread-seconds per stage; ``wall`` of placement through filter; hand, object, field),
             ``survivors`` and ``counts`` per stage, ``near_duplicates`` (across shards), ``distinct_poses``,
@@ -213,7 +214,7 @@ class GenerateJob(GenerateRequest, SearchJob):
             **({"negatives": both["negatives"]} if self.negatives else {}),
             "force_closure": both["closed"] / both["rows"] if both["rows"] else None,
             "near_duplicates": _near_duplicates(outcome.paths, inputs.device.alias),
-            "profile": self.pipeline.bounds.profile,
+            "profile": self.pipeline.bounds.told,
             **{f"{name}_per_s": made[of] / wall if wall else 0.0 for name, of in rates.items()},
             "survivors": survivors(sums["counts"]),
             "asked": self.rows,

@@ -32,3 +32,10 @@ def test_rows_at_a_bound_meet_it():
 def test_a_missing_metric_is_no_valid_row():
     with pytest.raises(KeyError, match="gswo"):
         GraspBounds().met_by({name: x for name, x in rows().items() if name != "gswo"})
+
+
+def test_looser_numbers_are_told_beside_the_profile():
+    assert GraspBounds(friction=0.4, min_contacts=3, max_penetration=0.0005).told == "strict"
+    assert GraspBounds(profile="plan", friction=0.4).told == "plan"
+    told = GraspBounds(friction=0.8, max_penetration=0.002, min_self_distance=0.0).told
+    assert told == "strict, but for max_penetration, min_self_distance, friction"

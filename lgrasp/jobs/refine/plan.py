@@ -140,7 +140,7 @@ class PlanJob(PlanRequest, Job):
         of ``profile``."""
         _, hand, model, _ = self._models
         data: dict[str, Any] = {"hand": hand.name, "object": model.name, "starts": self.starts, "grasps": outcome.rows}
-        data |= {"points": self.cloud is not None, "profile": self.params.bounds.profile}
+        data |= {"points": self.cloud is not None, "profile": self.params.bounds.told}
         data |= {"force_closure": closure_share(outcome.paths), "seconds_planning": sum(outcome.results)}
         data |= {"counts": {}, "epsilon": None, "unresisted_load": None, "valid": 0}
         for path in outcome.paths:

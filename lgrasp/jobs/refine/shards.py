@@ -186,7 +186,7 @@ def _entry(path: Path) -> dict[str, Any]:
     """What a refined shard says of itself."""
     with ShardReader(path) as reader:
         statistics, attributes = reader.statistics, reader.attributes
-        profile = stored_bounds(reader.header.config).profile
+        profile = stored_bounds(reader.header.config).told
         refined, valid, energy = (reader.column(f"metrics/{name}") for name in ("refined", "valid", "energy"))
         rows, objects = len(reader), reader.objects()
     tried = max(int(statistics["refine_tried"]), 1)
