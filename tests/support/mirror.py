@@ -93,15 +93,15 @@ class Mirror:
 
     def handle(self, number: int) -> int:
         """That of a mesh or tree on the other device; 0, of none, stays."""
-        if number and number not in self._twins:
+        if not number:
+            return 0
+        if number not in self._twins:
             if number not in self._owners:
                 raise LookupError(f"no mesh or tree {number}")
             own = self._owners[number]
             parts = (own.points, own.indices) if isinstance(own, wp.Mesh) else (own.lowers, own.uppers)
             more = {"support_winding_number": True} if isinstance(own, wp.Mesh) else {}
             self._twins[number] = own, type(own)(*(wp.clone(part, device=self.device) for part in parts), **more)
-        if not number:
-            return 0
         own, twin = self._twins[number]
         if isinstance(own, wp.Mesh):  # its points may have moved
             wp.copy(twin.points, own.points)
