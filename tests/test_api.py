@@ -1,11 +1,14 @@
 """The verbs of ``import lgrasp as lg`` one after another, in memory and in files."""
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from support.kernels import kernel_folder
 from support.places import QUICK
 
 import lgrasp as lg
@@ -99,6 +102,25 @@ def test_refine_simulate_judge(grasps):
     held = lg.simulate(some, "fc")
     np.testing.assert_array_equal(held.q, some.q)
     assert held.physics["fc_holds"].shape == (3,)
+
+
+FORKED = """
+import multiprocessing, sys, warnings
+import lgrasp as lg
+rows = lg.open(sys.argv[1])
+warnings.simplefilter("ignore")
+one = lg.refine(rows, matching_rounds=1)
+with multiprocessing.get_context("fork").Pool(1) as pool:
+    other = pool.apply_async(lg.refine, [rows], {"matching_rounds": 1}).get(60)
+assert (one.q == other.q).all()
+"""
+
+
+def test_a_forked_process_refines_as_well(grasps, tmp_path):
+    """What torch and Warp started before the fork is not there."""
+    file = grasps[:3].save(tmp_path / "some.h5")
+    env = os.environ | {"WARP_CACHE_PATH": str(kernel_folder())}
+    subprocess.run([sys.executable, "-c", FORKED, file], env=env, check=True, timeout=100)
 
 
 def test_plan():

@@ -17,6 +17,7 @@ from lgrasp.paths import name_problem, user_path
 
 _SAME_SHAPE = 0.01  # [m] that joints of hands of one shape are apart at most
 _SAME_FRAME = 0.1  # [rad] that their frames are turned at most
+_OWN_FILES = ("approximation", "licence", "source", "notes")  # what rules say of the files beside them
 
 
 @dataclass(frozen=True)
@@ -107,9 +108,8 @@ def rules_of_known(path: Path, folders: Iterable[Path] | None = None) -> HandSou
     if other := turned > _SAME_FRAME or away > _SAME_SHAPE:
         note += ": 'lgrasp hands add' drafts rules for them"
     added = {name: coupling for name, coupling in source.spec.mimic.items() if name not in stated}
-    spec, left_out = _without_misfits(
-        urdf, source.spec.model_copy(update={"mimic": added | missing, "approximation": "", "name": name})
-    )
+    changed = dict.fromkeys(_OWN_FILES, "") | {"mimic": added | missing, "name": name}
+    spec, left_out = _without_misfits(urdf, source.spec.model_copy(update=changed))
     return HandSource(name, path, spec, note + left_out, "" if other else source.name)
 
 

@@ -4,6 +4,7 @@ import atexit
 import contextlib
 import ctypes
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -65,6 +66,15 @@ def _share_memory() -> None:
     if "MALLOC_ARENA_MAX" not in os.environ:
         with contextlib.suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).mallopt(-8, cores())  # M_ARENA_MAX; 8 a core by default
+
+
+def _without_threads() -> None:
+    """A forked process has none of the threads that torch started before, and would wait for them for ever."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+
+os.register_at_fork(after_in_child=_without_threads)
 
 
 @contextlib.contextmanager

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import warp as wp
 from support.forked import start_forked
+from support.kernels import kernel_folder
 
 from lgrasp.bench.soak.processes import WAYS
 from lgrasp.bench.soak.trials import Soak
@@ -22,7 +22,7 @@ LATEST = 0.5  # of a duration, which the next run may fall short of
 def test_random_moments(load, cache_root, tmp_path):
     load("tiny")  # what the commands begin with, and other tests
     random, ways = np.random.default_rng(15), cycle(WAYS)
-    place = Soak(tmp_path, Path(wp.config.kernel_cache_dir).parent, cache=cache_root, launch=start_forked)
+    place = Soak(tmp_path, kernel_folder(), cache=cache_root, launch=start_forked)
     moments = random.uniform(0.0, LATEST, sum(TIMES.values())).tolist()
     names = [name for name, times in TIMES.items() for _ in range(times)]
     found = [place.end(name, next(ways), moment) for name, moment in zip(names, moments, strict=True)]

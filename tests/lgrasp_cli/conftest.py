@@ -2,11 +2,10 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
-import warp as wp
 from support.jaws import Jaws
+from support.kernels import kernel_folder
 from support.places import QUICK
 
 from lgrasp import notices
@@ -89,8 +88,7 @@ def once(tmp_path_factory):
 @pytest.fixture
 def process(shared_cache, tmp_path):
     """process(*arguments): start the command as a process of its own."""
-    kernels = Path(wp.config.kernel_cache_dir).parent  # Warp adds its version
-    env = os.environ | {"LGRASP_CACHE_DIR": str(shared_cache), "WARP_CACHE_PATH": str(kernels)}
+    env = os.environ | {"LGRASP_CACHE_DIR": str(shared_cache), "WARP_CACHE_PATH": str(kernel_folder())}
 
     def begin(*arguments):
         command = [sys.executable, "-m", "lgrasp_cli", *map(str, arguments)]

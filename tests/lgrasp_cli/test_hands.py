@@ -67,7 +67,7 @@ def test_shipped_hands_say_that_they_are_approximations(cli, jaws, tmp_path):
     assert "approximation" not in cli("hands", "show", jaws).out
     (tmp_path / "real.urdf").write_bytes((ROOT / "hands" / "allegro" / "hand.urdf").read_bytes())
     real = json.loads(cli("hands", "show", tmp_path / "real.urdf", "--json", "-").out)
-    assert (real["name"], real["approximation"]) == ("real", "")
+    assert [real[key] for key in ("name", "approximation", "licence", "source", "notes")] == ["real", "", "", "", []]
 
 
 def test_check_measures_the_spaces(cli, jaws, quick, tmp_path):

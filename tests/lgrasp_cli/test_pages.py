@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import warp as wp
+from support.kernels import kernel_folder
 from support.pictures import PLAIN
 from support.places import QUICK, ROOT
 
@@ -104,7 +104,7 @@ def test_pages_run_with_a_wheel(installed, shared_cache, tmp_path):
         assert len(ran[Path(page).stem]) >= 5
     env = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "LGRASP_"))}
     env |= {"PYTHONPATH": str(installed), "LGRASP_CACHE_DIR": str(shared_cache)}
-    env["WARP_CACHE_PATH"] = str(Path(wp.config.kernel_cache_dir).parent)  # Warp adds its version
+    env["WARP_CACHE_PATH"] = str(kernel_folder())
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT],
         input=json.dumps([ran, SETTINGS]),

@@ -4,12 +4,11 @@ import ast
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import typer
-import warp as wp
 from support.fresh import HEAVY, SLOW, loaded
+from support.kernels import kernel_folder
 from support.places import TINY_SHARD
 
 import lgrasp
@@ -94,7 +93,7 @@ def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_pat
     code += "kernels.load_kernels = lambda device, modules, told: print(modules) or load(device, modules, told)\n"
     code += f"try:\n    main()\nfinally:\n    print([m for m in {SLOW} if m in sys.modules])\n"
     code += "    print([m for m in sys.modules if m.startswith(('lgrasp.refine.', 'lgrasp.hand.drafting'))])"
-    env = os.environ | {"WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent)}  # Warp adds its version
+    env = os.environ | {"WARP_CACHE_PATH": str(kernel_folder())}
     result = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
     compiled, slow, others = result.stdout.splitlines()[-3:]
     stages = {name.split(".")[2] for name in ast.literal_eval(compiled) if name.startswith("lgrasp.stages.")}

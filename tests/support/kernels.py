@@ -9,6 +9,11 @@ from lgrasp.runtime.kernel_cache import note_checksums
 from lgrasp.runtime.kernels import kernel_modules
 
 
+def kernel_folder() -> Path:
+    """Where kernels are, as a ``WARP_CACHE_PATH`` of other processes: Warp adds its version."""
+    return Path(wp.config.kernel_cache_dir).parent
+
+
 def compile_together(folder: Path, *, backwards: bool) -> None:
     """Compile the kernels of all imported modules that no other process compiles; wait for those that one does.
 

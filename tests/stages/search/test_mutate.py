@@ -111,16 +111,16 @@ def reference(domains, params, row, start):
         return own + ([palm] if palm >= 0 else []) + [-1] * (groups - len(own) + (palm < 0))
 
     def measure(sets):
-        out = wp.zeros(len(sets), dtype=wp.float32)
-        s = wp.array(np.array(sets, np.int32), dtype=wp.int32, ndim=2)
+        out = wp.zeros(len(sets), dtype=wp.float32, device="cpu")
+        s = wp.array(np.array(sets, np.int32), dtype=wp.int32, ndim=2, device="cpu")
         given = [s, obj.struct.contact_points, obj.struct.contact_normals, context.bounds.torque_scale]
-        wp.launch(residuals, len(sets), given, [out])
+        wp.launch(residuals, len(sets), given, [out], device="cpu")
         return out.numpy()
 
     score = measure([surfaces({})])[0]
     history = [score]
-    x = wp.zeros(len(normals), dtype=wp.vec3)
-    wp.launch(tangents, len(normals), [obj.struct.contact_normals], [x])
+    x = wp.zeros(len(normals), dtype=wp.vec3, device="cpu")
+    wp.launch(tangents, len(normals), [obj.struct.contact_normals], [x], device="cpu")
     for _ in range(params.sweeps):
         for pivot in range(params.pivots):
             g = owner[pivot % k]
