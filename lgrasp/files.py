@@ -2,6 +2,7 @@
 
 import atexit
 import errno
+import fcntl
 import glob
 import hashlib
 import os
@@ -51,7 +52,7 @@ def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator[IO
                 yield file
                 file.flush()
                 if flush:
-                    os.fsync(file.fileno())
+                    _sync(file.fileno())
             os.replace(temporary, path)
         finally:
             _discard(temporary)
@@ -368,9 +369,18 @@ def _machine() -> str:
     return "".join(hashlib.sha256(text.encode()).hexdigest()[:6] for text in (platform.node(), start))
 
 
+def _sync(descriptor: int) -> None:
+    """Have the disk keep what was written; macOS leaves it in the disk's memory unless asked otherwise."""
+    if hasattr(fcntl, "F_FULLFSYNC"):
+        with suppress(OSError):  # a disk that cannot
+            fcntl.fcntl(descriptor, fcntl.F_FULLFSYNC)
+            return
+    os.fsync(descriptor)
+
+
 def _sync_folder(folder: Path) -> None:
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        _sync(descriptor)
     finally:
         os.close(descriptor)

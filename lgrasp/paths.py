@@ -112,6 +112,18 @@ def name_problem(name: str) -> str:
     return ""
 
 
+def free_name(stem: str, suffix: str, taken: Iterable[str]) -> str:
+    """The first of STEM, STEM_2, STEM_3, ... with a suffix that is not taken, in whatever case."""
+    used = {name.casefold() for name in taken}
+    tries = (f"{stem}{number}{suffix}" for number in ("", *(f"_{n}" for n in range(2, len(used) + 3))))
+    return next(name for name in tries if name.casefold() not in used)
+
+
+def is_litter(name: str) -> bool:
+    """Whether a file of this name is none of the user's: macOS puts them beside what it shows or copies."""
+    return name == ".DS_Store" or name.startswith("._")
+
+
 def named_paths(
     names: Iterable[str], known: Container[str], usable: Callable[[Path], bool], empty: Callable[[str], LgraspError]
 ) -> tuple[str, ...]:

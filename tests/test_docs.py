@@ -56,6 +56,13 @@ def test_every_metric_is_explained():
     assert [name for name in HOLD_METRICS if f"`{name}`" not in page] == []
 
 
+def test_commands_can_be_pasted_into_any_shell():
+    """zsh takes a comment behind a command as its arguments."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        assert re.findall(r"^\$? ?(?:lgrasp|pip|make) [^`|]* # .*", text, flags=re.MULTILINE) == [], page
+
+
 def test_pages_are_short():
     words = sum(len(page.read_text(encoding="utf-8").split()) for page in DOCS.rglob("*.md"))
     assert words <= 25_000, f"docs have {words} words: tell each fact once, and link to it"

@@ -12,6 +12,7 @@ from pathlib import Path
 from struct import unpack_from
 
 from lgrasp.errors import ShardError, short_reason
+from lgrasp.paths import is_litter
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 """Shard files, or folders of them."""
@@ -108,9 +109,8 @@ def walk(top: Path, *, hidden: bool = True) -> Iterator[tuple[Path, list[str]]]:
 
 def _inside(folder: Path, *, deep: bool) -> list[Path]:
     """The shard files in a folder, sorted."""
-    if not deep:
-        return sorted(folder.glob("*.h5"))
-    return sorted(here / name for here, names in walk(folder) for name in names if name.endswith(".h5"))
+    found = (here / name for here, names in walk(folder) for name in names) if deep else folder.iterdir()
+    return sorted(path for path in found if path.suffix == ".h5" and not is_litter(path.name))
 
 
 def named_files(paths: Paths) -> list[Path]:

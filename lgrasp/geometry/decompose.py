@@ -1,6 +1,5 @@
 """Triangle mesh -> convex pieces by CoACD, in a separate process, which may hang, crash or print anything."""
 
-import contextlib
 import ctypes
 import hashlib
 import io
@@ -9,10 +8,12 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
 from pathlib import Path
+from threading import Thread
 from typing import Protocol
 
 import numpy as np
@@ -176,11 +177,19 @@ def _main(parent: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent ends in any way, in the middle of native code too (Linux)."""
-    with contextlib.suppress(OSError, AttributeError):
+    """End this process when its parent ends in any way, in the middle of native code too."""
+    try:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    except (OSError, AttributeError):  # not Linux
+        Thread(target=_end_after, args=(parent,), daemon=True).start()
     if os.getppid() != parent:
         sys.exit(1)
+
+
+def _end_after(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_POLL)
+    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ def find_shards(given: Sequence[str | Path]) -> list[Path]:
 
 
 def _inside(top: Path) -> list[Path]:
-    """Shards in a folder and those below it, sorted; each folder once."""
+    """Shards in a folder and those below it, sorted; each folder once. macOS puts a ``._NAME`` beside some files."""
     found: list[Path] = []
     seen: set[str] = set()
     for folder, below, names in os.walk(top, followlinks=True):
@@ -37,7 +37,7 @@ def _inside(top: Path) -> list[Path]:
             continue
         seen.add(real)
         below.sort()
-        found += [Path(folder, name) for name in names if name.endswith(".h5")]
+        found += [Path(folder, name) for name in names if name.endswith(".h5") and not name.startswith("._")]
     return sorted(found)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lgrasp.errors import ObjectError
 from lgrasp.notices import notice
-from lgrasp.paths import data_dirs, name_problem, named_paths, package_files, user_path
+from lgrasp.paths import data_dirs, is_litter, name_problem, named_paths, package_files, user_path
 from lgrasp.words import listed
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", ".3mf")
@@ -62,7 +62,7 @@ def _tell_left_out(folder: Path) -> None:
 
 
 def _is_mesh(path: Path) -> bool:
-    return path.suffix.lower() in MESH_SUFFIXES and path.is_file()
+    return path.suffix.lower() in MESH_SUFFIXES and path.is_file() and not is_litter(path.name)
 
 
 def find_object(name_or_path: str | os.PathLike[str]) -> Path:

@@ -98,6 +98,28 @@ def test_who_waits_is_told_and_may_stop_it():
         decompose(mesh.vertices, mesh.faces, what="a ball", tell=tell)
 
 
+CHILD = """
+import sys, time
+from lgrasp.geometry import decompose
+decompose.ctypes.CDLL = lambda name: object()  # a system that ends no process with its parent
+decompose._end_with(int(sys.argv[1]))
+print("begun", flush=True)
+time.sleep(100)
+"""
+PARENT = """
+import os, subprocess, sys
+words = [sys.executable, "-c", sys.argv[1], str(os.getpid())]
+print(subprocess.Popen(words, stdout=subprocess.PIPE, text=True).stdout.readline())
+os._exit(0)
+"""
+
+
+def test_a_helper_ends_with_its_parent_on_any_system():
+    command = [sys.executable, "-c", PARENT, CHILD]
+    done = subprocess.run(command, capture_output=True, timeout=50, check=False)  # until both have closed its pipes
+    assert (done.returncode, done.stdout.split(), done.stderr) == (0, [b"begun"], b"")
+
+
 LONG = """
 import trimesh
 from lgrasp.geometry.decompose import decompose

@@ -93,8 +93,9 @@ def test_it_stands_alone(tmp_path):
 
 
 def test_each_file_is_judged_once(tmp_path):
-    """Also one that two paths name; links to folders are followed."""
+    """Also one that two paths name; links to folders are followed, what macOS leaves beside files is left out."""
     path = write_shard(tmp_path / "data" / "a.h5", [row()])
+    (path.parent / "._a.h5").write_bytes(bytes(9))
     (tmp_path / "linked").mkdir()
     (tmp_path / "linked" / "data").symlink_to(path.parent)
     (path.parent / "round").symlink_to(path.parent)

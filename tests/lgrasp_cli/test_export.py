@@ -136,6 +136,22 @@ def test_what_is_left_out_is_told_once(cli, tmp_path):
     assert "2 of 3 files are left out" in line
 
 
+def test_what_macos_leaves_beside_files_is_nobody_s(cli, tmp_path):
+    for name in ("made/.DS_Store", "made/._hand", "._a.h5", "meshes/._a.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(bytes(9))
+    make_shard(tmp_path / "a.h5", n=3)
+    assert cli("dataset", "check", ".").code == 0
+    command = ("export", ".", "--to", "isaac-grasp", "--out", "made", "--licence", "MIT")
+    assert cli(*command).code == 0
+    assert "._" not in (tmp_path / "made" / "SHA256SUMS").read_text()
+    for name in ("made/grasps/._cup.yaml", "made/hand/.DS_Store"):
+        (tmp_path / name).touch()
+    assert len(read_grasps(tmp_path / "made", "isaac-grasp").grasps) == 3
+    assert cli(*command, "--overwrite").code == 0
+    assert "'meshes' holds no mesh" in cli("generate", "--object", "meshes").error()
+
+
 def test_an_export_that_is_replaced(cli, tmp_path):
     """--overwrite leaves nothing of the export before, and touches no file that is not of it."""
     first = make_shard(tmp_path / "a.h5", n=9)

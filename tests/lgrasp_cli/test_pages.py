@@ -61,7 +61,7 @@ def blocks(page: str) -> Iterator[tuple[str, str]]:
 def commands(block: str) -> Iterator[list[str]]:
     """The words of each line after lgrasp, with fewer rows."""
     for line in block.splitlines():
-        command, *words = shlex.split(line, comments=True)
+        command, *words = shlex.split(line)  # no comments: zsh takes them as words
         assert command == "lgrasp"
         yield [*words, *FEWER.get(words[0], ())]
 

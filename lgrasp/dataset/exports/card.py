@@ -11,6 +11,7 @@ from lgrasp.dataset.exports.selection import Selection
 from lgrasp.dataset.files import sha256
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.files import write_file
+from lgrasp.paths import is_litter
 from lgrasp.words import listed, plural
 
 CARD, RUNS, SUMS = "README.md", "provenance.json", "SHA256SUMS"
@@ -74,7 +75,7 @@ def publish(out: Path, selection: Selection, licence: str, conditions: list[str]
     write_file(out / RUNS, json.dumps(runs, indent=1) + "\n")
     write_file(out / CARD, _card(out, selection, licence, conditions, runs))
     files = sorted(path for path in out.rglob("*") if path.is_file() and not path.match(_TEMPORARY))
-    files = [path for path in files if path.name not in _NOT_SUMMED]
+    files = [path for path in files if path.name not in _NOT_SUMMED and not is_litter(path.name)]
     write_file(out / SUMS, "".join(f"{sha256(path)}  {path.relative_to(out).as_posix()}\n" for path in files))
 
 

@@ -15,6 +15,7 @@ from lgrasp.dataset.exports.selection import ExportObject, Selection
 from lgrasp.errors import OutputError
 from lgrasp.files import remove_leftovers, write_file
 from lgrasp.notices import notice
+from lgrasp.paths import is_litter
 from lgrasp.words import listed
 
 
@@ -30,7 +31,7 @@ def check_empty(out: Path, run_key: str = "") -> None:
         remove_leftovers(out, f"{Path(UNFINISHED).stem}.*.tmp")
         if _is_own(out, run_key):
             return
-        for first in sorted(path.name for path in out.iterdir()):
+        for first in sorted(path.name for path in out.iterdir() if not is_litter(path.name)):
             raise OutputError(f"{out} is not empty (it holds {first}); {rule}")
     except FileNotFoundError:
         return
@@ -63,7 +64,7 @@ def whole_export(out: Path, run_key: str) -> list[Path]:
     remove_leftovers(out, f"{Path(UNFINISHED).stem}.*.tmp")
     known = {out / str(name) for name in [*listed, INDEX, UNFINISHED]}
     there = _files(out)
-    if other := sorted(path.name for path in there if path not in known):
+    if other := sorted(path.name for path in there if path not in known and not is_litter(path.name)):
         raise OutputError(f"{out} holds {other[0]}, which is not of the export; move it, or choose another --out")
     return [path for path in there if path != out / UNFINISHED]
 
@@ -123,8 +124,8 @@ def begin(out: Path, run_key: str, before: Sequence[Path] = ()) -> None:
 
 def abandon(out: Path) -> None:
     """Remove the folder of an export that failed before its first file."""
-    if [path.name for path in out.iterdir()] == [UNFINISHED]:
-        (out / UNFINISHED).unlink()
+    if [path.name for path in out.iterdir() if not is_litter(path.name)] == [UNFINISHED]:
+        remove(out, _files(out))
         out.rmdir()
 
 

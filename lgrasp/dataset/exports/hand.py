@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -15,6 +15,7 @@ from lgrasp.geometry.quiet import quiet_parsers
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.links import joint_values
 from lgrasp.hand.urdf import parse_robot
+from lgrasp.paths import free_name
 
 _LOG = "yourdfpy.urdf"  # which complains of joints that mimic one that mimics another
 
@@ -53,13 +54,6 @@ def _file_name(path: str, taken: dict[str, str]) -> str:
     pure = PurePosixPath(path.replace("\\", "/"))
     stem = re.sub(r"[^A-Za-z0-9_.-]+", "_", pure.stem).lstrip(".") or "mesh"
     return free_name(f"meshes/{stem}", re.sub(r"[^A-Za-z0-9.]+", "", pure.suffix), set(taken.values()))
-
-
-def free_name(stem: str, suffix: str, taken: Iterable[str]) -> str:
-    """The first of STEM, STEM_2, STEM_3, ... with a suffix that is not taken, in whatever case."""
-    used = {name.casefold() for name in taken}
-    tries = (f"{stem}{number}{suffix}" for number in ("", *(f"_{n}" for n in range(2, len(used) + 3))))
-    return next(name for name in tries if name.casefold() not in used)
 
 
 class HandFrames:

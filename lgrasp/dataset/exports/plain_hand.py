@@ -7,13 +7,13 @@ from pathlib import Path, PurePosixPath
 from lxml import etree
 
 from lgrasp.dataset.exports.folder import mesh_text
-from lgrasp.dataset.exports.hand import free_name
 from lgrasp.errors import ShardError, short_reason
 from lgrasp.grasp.hand_files import checked_urdf
 from lgrasp.grasp.records import HandRecord
 from lgrasp.hand.couplings import find_drives
 from lgrasp.hand.geometry import read_mesh
 from lgrasp.hand.urdf import Joint, Urdf, parse_robot
+from lgrasp.paths import free_name
 
 
 def plain_hand(hand: HandRecord) -> HandRecord:

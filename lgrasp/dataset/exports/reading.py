@@ -16,6 +16,7 @@ from lgrasp.geometry.poses import canonical, inverse
 from lgrasp.grasp.records import GraspRows
 from lgrasp.grasp.schema import POSTURES
 from lgrasp.object.find import mesh_files
+from lgrasp.paths import is_litter
 
 
 class ReadObject(NamedTuple):
@@ -196,7 +197,8 @@ def open_folder(path: Path | str, suffix: str, layout: str, wanted: Sequence[str
     index, urdf = path / INDEX, path / HAND / "hand.urdf"
     if not index.exists() and urdf.exists():
         raise ShardError(f"{path}: the export is incomplete, it has no {INDEX}; export again")
-    files = tuple(sorted((path / GRASPS if index.exists() else path).rglob(f"*{suffix}")))
+    inside = (path / GRASPS if index.exists() else path).rglob(f"*{suffix}")
+    files = tuple(sorted(file for file in inside if not is_litter(file.name)))
     if not files:
         raise ShardError(f"{path}: no {suffix} file in it")
     if not index.exists():

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lgrasp.dataset.conditions import ALL, OBJECTS_HELD, Condition, satisfied_or_invalid
-from lgrasp.dataset.exports.hand import free_name
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.reader import ShardReader
@@ -18,6 +17,7 @@ from lgrasp.dataset.split import Split
 from lgrasp.errors import ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.grasp.schema import CHUNK_ROWS, POSTURES
+from lgrasp.paths import free_name
 from lgrasp.words import plural
 
 _NUMBER = re.compile("metrics/|physics/|candidate$")

@@ -8,7 +8,7 @@ import numpy as np
 from trimesh import Trimesh
 
 from lgrasp.dataset.exports.folder import GRASPS
-from lgrasp.dataset.exports.hand import HandFrames, free_name
+from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.dataset.exports.reading import WRONG, GraspSet, numbers, open_folder
 from lgrasp.dataset.exports.selection import ExportObject, Selection
@@ -16,6 +16,7 @@ from lgrasp.dataset.files import parsing
 from lgrasp.errors import ConfigError, ShardError
 from lgrasp.files import temporary_folder, write_file
 from lgrasp.geometry.poses import inverse, pose_from_matrix, pose_matrix
+from lgrasp.paths import free_name
 from lgrasp.picture.scene import HandShape
 from lgrasp.runtime.optional import import_optional
 

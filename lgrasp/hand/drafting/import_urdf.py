@@ -29,7 +29,7 @@ from lgrasp.hand.geometry import MOST_FACES, read_mesh, thin_mesh
 from lgrasp.hand.names import known_hands, name_of_file, slug
 from lgrasp.hand.spec import Box, ContactRule, HandSpec, load_spec
 from lgrasp.hand.urdf import MOVABLE, check_robot, find_mesh, is_mjcf, joint_end, read_robot
-from lgrasp.paths import cache_dir, data_dirs, user_dir, user_path
+from lgrasp.paths import cache_dir, data_dirs, free_name, is_litter, user_dir, user_path
 from lgrasp.words import listed
 
 _DRAFT_VERSION = 9
@@ -90,7 +90,7 @@ def import_urdf(
         if out is None and not force and (known := known_hands().get(name)):
             raise HandError(f"hand '{name}' is in {known}; choose another --name, or hide that one with --overwrite")
         no_hand = folder.exists() and not (folder / "hand.yaml").is_file()
-        if no_hand and not (folder.is_dir() and next(folder.iterdir(), None) is None):
+        if no_hand and not (folder.is_dir() and all(is_litter(path.name) for path in folder.iterdir())):
             raise HandError(f"{folder} holds something that is no hand (it has no hand.yaml); choose another --out")
         originals: dict[Path, Path] = {}
         try:
@@ -278,8 +278,7 @@ def _copy_mesh(file: Path, folder: Path, kind: str, taken: set[str], changes: li
     base = f"meshes/{kind}/{slug(file.stem)}"
     whole = _rewritten(file, huge=kind == "collision")
     suffix = file.suffix.lower() if whole is None else ".stl"
-    numbered = (f"{base}_{number}{suffix}" for number in itertools.count(2))
-    name = next(name for name in itertools.chain([f"{base}{suffix}"], numbered) if name not in taken)
+    name = free_name(base, suffix, taken)
     target = folder / name
     target.parent.mkdir(parents=True, exist_ok=True)
     if whole is not None:

@@ -96,13 +96,14 @@ def test_robots_that_are_no_trees_are_refused_as_such(tmp_path):
 
 
 def test_meshes_of_other_folders_are_taken_along(tmp_path):
+    """Under names that no disk takes for the same."""
     urdf, other = tmp_path / "deep" / "down" / "here", tmp_path / "other"
     urdf.mkdir(parents=True)
     (other / "meshes").mkdir(parents=True)
-    for place in ("meshes/tip.stl", "meshes/up.stl", "bare.stl"):
+    for place in ("meshes/tip.stl", "meshes/up.stl", "Tip.stl"):
         trimesh.creation.capsule(height=0.02, radius=0.008).export(other / place)
     path = fingers(urdf, 2, MESH.format("package://maker/meshes/tip.stl"))
-    two, bare = MESH.format("../../up/meshes/up.stl"), MESH.format("bare.stl")
+    two, bare = MESH.format("../../up/meshes/up.stl"), MESH.format("Tip.stl")
     path.write_text(path.read_text().replace(BAR, two, 1).replace(BAR, bare, 1))
     with pytest.raises(HandError, match=r"(not exist|outside).*hands add \S*fingers.urdf --mesh-dir FOLDER"):
         import_urdf(path, out=tmp_path / "made")
@@ -110,6 +111,7 @@ def test_meshes_of_other_folders_are_taken_along(tmp_path):
     shutil.rmtree(other)
     copy = made.folder / "hand.urdf"
     assert build_hand(copy, made.spec, pieces_only=True).groups == 2
+    assert len({path.name.lower() for path in (made.folder / "meshes" / "collision").iterdir()}) == 3
     before = hand_digest(copy, made.spec)
     trimesh.creation.capsule(height=0.021, radius=0.008).export(made.folder / "meshes" / "collision" / "tip.stl")
     assert hand_digest(copy, made.spec) != before
