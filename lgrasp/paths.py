@@ -119,6 +119,15 @@ def free_name(stem: str, suffix: str, taken: Iterable[str]) -> str:
     return next(name for name in tries if name.casefold() not in used)
 
 
+def as_on_disk(path: Path) -> str:
+    """A path by which its disk tells it from others: some disks take capital and small letters for the same."""
+    path = path.absolute()
+    there = next(folder for folder in (path, *path.parents) if folder.exists())
+    other = there.with_name(there.name.swapcase()) if there.name else there
+    same = other != there and other.exists() and other.samefile(there)
+    return str(path).casefold() if same else str(path)
+
+
 def is_litter(name: str) -> bool:
     """Whether a file of this name is none of the user's: macOS puts them beside what it shows or copies."""
     return name == ".DS_Store" or name.startswith("._")

@@ -35,7 +35,7 @@ from lgrasp.jobs.requests.search import GenerateRequest, SequenceRequest, hand_n
 from lgrasp.jobs.sets import SequenceSets, object_sequences
 from lgrasp.notices import notice
 from lgrasp.object.find import MESH_SUFFIXES, all_objects, find_object, list_objects, mesh_files
-from lgrasp.paths import user_path
+from lgrasp.paths import as_on_disk, user_path
 from lgrasp.steer.params import Steering
 
 _OF_SINGLE = {"batch", "negatives", "passes", "scale", "simulate", "table"}  # keys for one object a grasp
@@ -185,7 +185,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
     hands = [_urdf_in_folder(config.hand_dir, hand) for hand in all_hands(config.hands)]
     shared = config.model_dump(include={"rows", "device", "workers", "shard_rows"})
     found: list[Request] = []
-    takers: dict[Path, str] = {}
+    takers: dict[str, str] = {}
     known_name = cache(hand_name)
     for pipeline in _pipelines(config):
         if not sets:
@@ -202,7 +202,7 @@ def plan_requests(config: JobConfig) -> list[Request]:
             meshes = tuple(in_folder(config.object_dir, mesh) for mesh in names)
             called = _names(hand, meshes[0], known_name)[0]
             out = run_folder(config.out, called, sequence_name(names), pipeline.name, sets.simulate)
-            if (other := takers.setdefault(out, hand)) != hand:
+            if (other := takers.setdefault(as_on_disk(out), hand)) != hand:
                 raise ConfigError(_one_folder(other, hand, out))
             found.append(SequenceRequest(**what, hand=hand, objects=meshes, out=out))
     return found
@@ -224,7 +224,7 @@ def pair_requests(
     Raises:
         ConfigError: a value out of range, or two pairs with the same folder.
     """
-    found: dict[Path, GenerateRequest] = {}
+    found: dict[str, GenerateRequest] = {}
     known_name = cache(hand_name)
     name = f"{pipeline.name}-table" if pipeline.params("place").table else pipeline.name
     name = f"{name}-steer-{pipeline.steer.tag}" if pipeline.steer.asks else name
@@ -232,9 +232,9 @@ def pair_requests(
         out = run_folder(top, *_names(hand, mesh, known_name), name, protocol)
         what = {"hand": hand, "object": mesh, "pipeline": pipeline, "out": out}
         request = parse_model(GenerateRequest, what | shared, "generate")
-        if other := found.get(out):
+        if other := found.get(place := as_on_disk(out)):
             raise ConfigError(_one_folder(f"{other.hand} with {other.object}", f"{hand} with {mesh}", out))
-        found[out] = request
+        found[place] = request
     return list(found.values())
 
 

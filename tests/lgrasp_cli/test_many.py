@@ -39,6 +39,15 @@ def test_a_job_for_every_object(cli, meshes, quick, tmp_path):
     assert sum(shard["rows"] for shard in json.loads(info.out)) == 12
 
 
+def test_names_that_differ_in_case_only_are_two_where_the_disk_says_so(cli, meshes, quick, tmp_path):
+    (meshes / "sphere.obj").rename(meshes / "Tiny.obj")
+    plan = ("generate", "-p", quick, "-n", 4, "--device", "cpu", "--object", "meshes", "--dry-run")
+    assert cli(*plan).code == 0
+    (tmp_path / "grasps").mkdir()
+    (tmp_path / "GRASPS").symlink_to("grasps")  # as on a disk for which these are one
+    assert "have one folder" in cli(*plan).error()
+
+
 def test_what_is_left_out_of_a_folder_is_told(cli, meshes, quick):
     for name in ("b.STEP", "a.dae", "paint.mtl", "paint.png"):
         (meshes / name).touch()
