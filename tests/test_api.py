@@ -109,9 +109,10 @@ import multiprocessing, sys, warnings
 import lgrasp as lg
 rows = lg.open(sys.argv[1])
 warnings.simplefilter("ignore")
-one = lg.refine(rows, matching_rounds=1)
+how = {"matching_rounds": 1, "device": "cpu"}
+one = lg.refine(rows, **how)
 with multiprocessing.get_context("fork").Pool(1) as pool:
-    other = pool.apply_async(lg.refine, [rows], {"matching_rounds": 1}).get(60)
+    other = pool.apply_async(lg.refine, [rows], how).get(60)
 assert (one.q == other.q).all()
 """
 

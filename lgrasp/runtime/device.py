@@ -22,6 +22,7 @@ KERNEL_OPTIONS = {"enable_backward": False, "max_unroll": 1}
 """Module options of every non-differentiable kernel module (they decide compile time: minutes or seconds)."""
 
 _started = False
+_is_fork = False  # of a process that had started
 
 
 @dataclass(frozen=True)
@@ -68,13 +69,15 @@ def _share_memory() -> None:
             ctypes.CDLL(None).mallopt(-8, cores())  # M_ARENA_MAX; 8 a core by default
 
 
-def _without_threads() -> None:
+def _after_fork() -> None:
     """A forked process has none of the threads that torch started before, and would wait for them for ever."""
+    global _is_fork
+    _is_fork = _started
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
 
 
-os.register_at_fork(after_in_child=_without_threads)
+os.register_at_fork(after_in_child=_after_fork)
 
 
 @contextlib.contextmanager
@@ -105,13 +108,16 @@ def resolve_device(name: str = "auto") -> Device:
     """Turn ``auto``, ``cpu``, ``cuda`` or ``cuda:N`` into a device that exists.
 
     Raises:
-        DeviceError: the name is unknown or the GPU is absent; the message lists what exists.
+        DeviceError: the name is unknown or the GPU is absent (the message lists what exists), or it is a GPU and this a
+            process forked from one that has started Warp.
     """
     start()
     present = ["cpu", *(f"cuda:{i}" for i in range(wp.get_cuda_device_count()))]
     alias = {"auto": present[min(1, len(present) - 1)], "cuda": "cuda:0"}.get(name, name)
     if alias not in present:
         raise DeviceError(f"device '{name}' does not exist here; choose auto, {', '.join(present)}")
+    if alias != "cpu" and _is_fork:
+        raise DeviceError(f"a forked process cannot use {alias}: choose cpu, or start the process by 'spawn'")
     return Device(alias=alias, name=wp.get_device(alias).name if alias != "cpu" else _cpu_name())
 
 

@@ -59,6 +59,22 @@ def test_closed_stderr_does_not_stop_the_start():
     assert run(code).stdout.strip() == "cpu"
 
 
+def test_a_forked_process_is_told_that_it_cannot_use_a_gpu():
+    code = """
+import os, warp as wp
+from lgrasp.runtime.device import resolve_device, start
+start()
+wp.get_cuda_device_count = lambda: 1
+if os.fork():
+    os._exit(os.waitstatus_to_exitcode(os.wait()[1]))
+print(resolve_device("cpu").alias, flush=True)
+resolve_device("auto")
+"""
+    result = run(code)
+    assert (result.returncode, result.stdout) == (1, "cpu\n")
+    assert result.stderr.endswith("forked process cannot use cuda:0: choose cpu, or start the process by 'spawn'\n")
+
+
 @pytest.mark.parametrize("name", ["gpu", "cuda:99", "", "cpu:0"])
 def test_unknown_device_lists_what_exists(name):
     with pytest.raises(DeviceError, match=r"choose auto, cpu"):
