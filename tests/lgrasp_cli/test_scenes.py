@@ -104,6 +104,11 @@ def test_bad_objects(cli, generate, quick):
     assert "empty.obj: 0 bytes" in refused("tiny", "empty.obj")
     Path("tiny.obj").write_bytes(find_object("sphere").read_bytes())
     assert "have one name, 'tiny'" in refused("tiny", "./tiny.obj")
+    Path("made").mkdir()
+    Path("MADE").symlink_to("made")  # as on a disk that ignores case
+    Path("Tiny.obj").write_bytes(Path("tiny.obj").read_bytes())
+    same = cli("scenes", "make", "tiny", "Tiny.obj", *base, "--out", "made").error()
+    assert "have one name, 'Tiny'" in same
     Path("a.yaml").write_text("scenes: 1")
     assert "the config a.yaml is named alone" in refused("a.yaml", "tiny")
     assert generate(rows=3).code == 0

@@ -14,6 +14,7 @@ from lgrasp.errors import ConfigError
 from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.object.find import find_object
+from lgrasp.paths import as_on_disk
 from lgrasp.scenes.params import SceneParams
 
 
@@ -46,10 +47,9 @@ class SceneRequest(Request):
             hand_path(self.hand)
         found: dict[str, Path] = {}
         for path in map(find_object, self.objects):
-            if not path.samefile(found.setdefault(path.stem, path)):
-                raise ConfigError(
-                    f"objects {found[path.stem]} and {path} have one name, '{path.stem}'; rename one of the files"
-                )
+            other = found.setdefault(as_on_disk(self.out / path.stem), path)
+            if not path.samefile(other):
+                raise ConfigError(f"objects {other} and {path} have one name, '{path.stem}'; rename one of the files")
         if self.grasps is not None:
             shards_below(self.grasps)
         elif not self.objects:
