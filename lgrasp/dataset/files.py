@@ -65,7 +65,7 @@ def find_shards(paths: Paths, what: str = "shard") -> list[Path]:
         return [file for file, _ in _found(paths, deep=False, what=what)]
     except ShardError as error:
         below = folders_below(paths) if what == "shard" else []  # those below scenes hold their grasps
-        holding = [folder for folder in below if next(folder.glob("*.h5"), None)]
+        holding = [folder for folder in below if files_in(folder)]
         raise ShardError(f"{error}; name one of its folders, such as {holding[0]}") if holding else error from None
 
 
@@ -85,7 +85,7 @@ def shards_below(paths: Paths, leave_out: Path | None = None) -> list[tuple[Path
 def folders_below(paths: Paths, *, deep: bool = True) -> list[Path]:
     """The folders among some paths, and, of any depth, those below them that hold shards."""
     tops = [path for path in given_paths(paths) if path.is_dir()]
-    return list(dict.fromkeys(f for t in tops for f in (t, *sorted({s.parent for s in _inside(t, deep=deep)}))))
+    return list(dict.fromkeys(f for t in tops for f in (t, *sorted({s.parent for s in files_in(t, deep=deep)}))))
 
 
 def walk(top: Path, *, hidden: bool = True) -> Iterator[tuple[Path, list[str]]]:
@@ -107,9 +107,9 @@ def walk(top: Path, *, hidden: bool = True) -> Iterator[tuple[Path, list[str]]]:
         yield here, files
 
 
-def _inside(folder: Path, *, deep: bool) -> list[Path]:
-    """The shard files in a folder, sorted."""
-    found = (here / name for here, names in walk(folder) for name in names) if deep else folder.iterdir()
+def files_in(folder: Path, *, deep: bool = False) -> list[Path]:
+    """The ``*.h5`` files in a folder, sorted; ``deep``: also in those below it."""
+    found = (here / name for here, names in walk(folder) for name in names) if deep else folder.glob("*.h5")
     return sorted(path for path in found if path.suffix == ".h5" and not is_litter(path.name))
 
 
@@ -141,7 +141,7 @@ def _found(
             raise ShardError(f"{path}: no such file or folder")
         if not path.is_dir():
             check_regular(path)
-        found += [(file, path) for file in _inside(path, deep=deep)] if path.is_dir() else [(path, path.parent)]
+        found += [(file, path) for file in files_in(path, deep=deep)] if path.is_dir() else [(path, path.parent)]
     if leave_out is not None:
         found = [(file, top) for file, top in found if not file.resolve().is_relative_to(leave_out.resolve())]
     if not found:

@@ -21,8 +21,7 @@ from lgrasp.runtime.kernel_cache import drop_damaged, enter, note_checksums, usa
 KERNEL_OPTIONS = {"enable_backward": False, "max_unroll": 1}
 """Module options of every non-differentiable kernel module (they decide compile time: minutes or seconds)."""
 
-_started = False
-_is_fork = False  # of a process that had started
+_started_in = 0  # number of the process that started Warp: this one, or one that it was forked from
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,8 @@ def start() -> None:
 
     A ``WARP_CACHE_PATH`` set by the user wins.
     """
-    global _started
-    if _started:
+    global _started_in
+    if _started_in:
         return
     wp.config.log_level = wp.LOG_ERROR
     wanted = os.environ.get("WARP_CACHE_PATH") or cache_dir() / "kernels"
@@ -58,7 +57,7 @@ def start() -> None:
     enter(folder)
     drop_damaged(folder)
     atexit.register(note_checksums, folder)
-    _started = True
+    _started_in = os.getpid()
 
 
 def _share_memory() -> None:
@@ -69,15 +68,13 @@ def _share_memory() -> None:
             ctypes.CDLL(None).mallopt(-8, cores())  # M_ARENA_MAX; 8 a core by default
 
 
-def _after_fork() -> None:
+def _without_threads() -> None:
     """A forked process has none of the threads that torch started before, and would wait for them for ever."""
-    global _is_fork
-    _is_fork = _started
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
 
 
-os.register_at_fork(after_in_child=_after_fork)
+os.register_at_fork(after_in_child=_without_threads)
 
 
 @contextlib.contextmanager
@@ -116,7 +113,7 @@ def resolve_device(name: str = "auto") -> Device:
     alias = {"auto": present[min(1, len(present) - 1)], "cuda": "cuda:0"}.get(name, name)
     if alias not in present:
         raise DeviceError(f"device '{name}' does not exist here; choose auto, {', '.join(present)}")
-    if alias != "cpu" and _is_fork:
+    if alias != "cpu" and _started_in != os.getpid():
         raise DeviceError(f"a forked process cannot use {alias}: choose cpu, or start the process by 'spawn'")
     return Device(alias=alias, name=wp.get_device(alias).name if alias != "cpu" else _cpu_name())
 

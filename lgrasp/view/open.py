@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lgrasp.dataset.files import files_in
 from lgrasp.dataset.reader import open_hdf5
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.engine.cache import Cache
@@ -101,7 +102,7 @@ def _refuse(what: str, **options: object) -> None:
 def _maker(what: Sequence[str], cache: Cache, row: int, where: Sequence[str]) -> "_Make":
     """What makes the view, all input read."""
     name, path, kind = what[0], user_path(what[0]), kind_of(what)
-    inside = sorted(path.glob("*.h5")) if kind == "files" and path.is_dir() else [path]
+    inside = files_in(path) if kind == "files" and path.is_dir() else [path]
     if len(what) == 1 and inside and inside[0].is_file() and inside[0].suffix == ".h5":
         with open_hdf5(inside[0]) as file:
             is_scene = file.attrs.get("format") == FORMAT

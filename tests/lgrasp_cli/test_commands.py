@@ -344,6 +344,11 @@ def test_wrong_settings_of_a_bench_are_refused(cli):
         assert "--set 'bounds.frction=1'" in refused.err
 
 
+def test_bench_soak_needs_a_list_of_processes(cli, monkeypatch, tmp_path):
+    monkeypatch.setattr("lgrasp.bench.soak.processes._LISTED", tmp_path / "proc")
+    assert "which this system does not have" in cli("bench", "soak").error()
+
+
 def test_bench_table1_refuses(cli):
     assert "come after its name" in cli("bench", "--device", "cpu", "table1").error()
     assert ".png" in cli("bench", "table1", "--plot", "t.pdf").error()

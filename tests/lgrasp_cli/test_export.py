@@ -136,7 +136,7 @@ def test_what_is_left_out_is_told_once(cli, tmp_path):
     assert "2 of 3 files are left out" in line
 
 
-def test_what_macos_leaves_beside_files_is_nobody_s(cli, tmp_path):
+def test_what_macos_leaves_beside_files_is_left_out(cli, tmp_path):
     for name in ("made/.DS_Store", "made/._hand", "._a.h5", "meshes/._a.obj"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(bytes(9))

@@ -15,6 +15,7 @@ from lgrasp.errors import LgraspError
 LONGEST = 60.0
 """Seconds after which an ended command and all processes that it started must be gone."""
 
+_LISTED = Path("/proc")
 _TWICE = 0.3  # [s] between two Ctrl-C
 
 
@@ -92,10 +93,20 @@ def kill(running: Running) -> None:
         os.killpg(running.pid, signal.SIGKILL)
 
 
+def check_system() -> None:
+    """Check that processes can be looked for.
+
+    Raises:
+        LgraspError: a system that does not list them.
+    """
+    if not (_LISTED / "self").exists():
+        raise LgraspError(f"processes are looked for in {_LISTED}, which this system does not have; Linux has it")
+
+
 def catches(process: int, number: int) -> bool:
     """True if a process handles a signal, or is gone."""
     try:
-        status = Path(f"/proc/{process}/status").read_text()
+        status = (_LISTED / str(process) / "status").read_text()
         return bool(int(status.partition("SigCgt:")[2].split()[0], 16) >> (number - 1) & 1)
     except (OSError, IndexError):
         return True
@@ -103,7 +114,7 @@ def catches(process: int, number: int) -> bool:
 
 def processes(session: int, marked: bytes) -> Iterator[str]:
     """Processes of a session, or with a word in their environment, as number and command line."""
-    for folder in Path("/proc").iterdir():
+    for folder in _LISTED.iterdir():
         if not folder.name.isdecimal() or int(folder.name) == os.getpid():
             continue
         with suppress(OSError, ValueError, IndexError):

@@ -14,7 +14,18 @@ import numpy as np
 
 from lgrasp.bench.soak.commands import COMMANDS
 from lgrasp.bench.soak.digests import digest, tree
-from lgrasp.bench.soak.processes import LONGEST, WAYS, Launch, Running, catches, kill, processes, start_process, wait
+from lgrasp.bench.soak.processes import (
+    LONGEST,
+    WAYS,
+    Launch,
+    Running,
+    catches,
+    check_system,
+    kill,
+    processes,
+    start_process,
+    wait,
+)
 from lgrasp.errors import ConfigError, LgraspError
 from lgrasp.hand.find import find_hand
 
@@ -227,8 +238,10 @@ def soak(
         hours: go on until so much time has passed, however many rounds that takes.
 
     Raises:
-        LgraspError: an unknown name, or a command that fails without being disturbed.
+        LgraspError: an unknown name, a system that does not list processes, or a command that fails without being
+            disturbed.
     """
+    check_system()
     if unknown := [way for way in ways if way not in WAYS]:
         raise ConfigError(f"way '{unknown[0]}': choose from {', '.join(WAYS)}")
     random, begin, done = np.random.default_rng(seed), time.monotonic(), 0

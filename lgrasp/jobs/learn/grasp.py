@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from lgrasp.cloud.model import cloud_object
+from lgrasp.dataset.files import files_in
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Made, Part, PartProgress
@@ -147,7 +148,7 @@ def evaluate(
         LgraspError: shards cannot be used.
     """
     folders = {} if out is None else {kind: out / kind.replace(" ", "-") for kind in KINDS}
-    there = [file for folder in folders.values() for file in sorted(folder.glob("*.h5"))]
+    there = [file for folder in folders.values() for file in files_in(folder)]
     if there and not overwrite:
         raise OutputError(f"{there[0]} is of an evaluation before; choose another --out, or --overwrite to replace it")
     found = resolve_device(device)
