@@ -31,7 +31,6 @@ from lgrasp.jobs.listing import list_hands, list_objects, list_pipelines
 from lgrasp.jobs.shard_inputs import named_hand, named_object
 from lgrasp.object.model import ObjectModel
 from lgrasp.paths import as_name
-from lgrasp.runtime.device import resolve_device
 from lgrasp.simulate.protocol import Protocol, find_protocol
 
 if TYPE_CHECKING:
@@ -319,22 +318,22 @@ def read_cloud(path: Name, mask: Name | None = None, label: int | None = None, *
     return _read_cloud(path, mask, label, read_scene=scene_cloud, **options)
 
 
-def load_hand(name: Name, device: "DeviceName" = "cpu") -> Hand:
+def load_hand(name: Name) -> Hand:
     """A hand by name, URDF, folder with hand.yaml, or shard.
 
     Raises:
         LgraspError: there is no such hand, or it cannot be used.
     """
-    return named_hand(Cache(), as_name(name, "name"), resolve_device(str(device)))[1]
+    return named_hand(Cache(), as_name(name, "name"))[1]
 
 
-def load_object(name: Name, scale: float = 1.0, device: "DeviceName" = "cpu") -> Object:
+def load_object(name: Name, scale: float = 1.0) -> Object:
     """An object by name or mesh file, or that of a shard.
 
     Raises:
         LgraspError: there is no such object, or it cannot be used.
     """
-    return named_object(Cache(), as_name(name, "name"), scale, resolve_device(str(device)))
+    return named_object(Cache(), as_name(name, "name"), scale)
 
 
 def hands() -> dict[str, str]:

@@ -6,6 +6,7 @@ import typer
 from typer import Option
 
 from lgrasp.choices import FieldIndex
+from lgrasp.notices import notice
 from lgrasp.words import number
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import (
@@ -34,7 +35,7 @@ def build_field(
         str | None, Option(**one_of(FieldIndex, "INDEX", "How the field is looked up; default: the pipeline's."))
     ] = None,
     pipeline: PipelineName = "robust",
-    device: Device = "auto",
+    device: Annotated[str | None, Option(hidden=True)] = None,
     cache_dir: CacheDir = None,
     rebuild: _Rebuild = False,
 ) -> Answer:
@@ -42,13 +43,15 @@ def build_field(
 
     Example: lgrasp build-field allegro
     """
+    if device is not None:
+        notice("--device is of no use: fields are built on the CPU; the option works in this release only")
     cache = open_cache(cache_dir, fresh=rebuild)
     params = choose_pipeline(pipeline, settings=[f"field.index={index}"] if index else None).field
     from lgrasp.jobs.prepare import prepare_field
     from lgrasp_cli.progress import Bar
 
     with Bar() as bar:
-        data = prepare_field(cache, hand, params, device=device, report=bar.share)
+        data = prepare_field(cache, hand, params, report=bar.share)
     clear = "  ".join(number(share, ".0%") for share in data["clear_share"])
     pairs = [
         ("hand", f"{data['hand']}: {data['groups']} fingers, {data['joints']} joints"),

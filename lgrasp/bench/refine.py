@@ -142,8 +142,8 @@ def _bench_hand(
     cache: Cache,
     progress: Callable[[str], None],
 ) -> dict[str, Any]:
-    source, model = named_hand(cache, hand, at)
-    touching, palmar = palmar_side(cache, source, model, at)
+    source, model = named_hand(cache, hand)
+    touching, palmar = palmar_side(cache, source, model)
     arrays = upload_hand(touching, at.alias)
     meshes = mesh_blobs(source.urdf)
     stand_off = source.spec.stand_off or STAND_OFF
@@ -151,8 +151,8 @@ def _bench_hand(
     coarse: list[tuple[ObjectModel, Pose]] = []
     for name in objects:
         mesh, key = object_key(name, 1.0, ObjectParams())
-        found = Loader(cache, at.alias).object(mesh, key, 1.0, ObjectParams())
-        scene = make_scene(cache, model, [object_record(found)], meshes, at.alias)
+        found = Loader(cache).object(mesh, key, 1.0, ObjectParams())
+        scene = make_scene(cache, model, [object_record(found)], meshes)
         for (on, hands), (noise, params) in planners.items():
             total, target = totals[on, hands], found if noise is None else _cloud(found, noise)
             planner = Planner(arrays, target, stand_off, params, palmar)

@@ -108,7 +108,7 @@ def measure_sequence(job: SequenceJob, device: str) -> dict[str, Any]:
     used, bounds = resolve_device(job.device), job.pipeline.bounds
     pipeline, cache, keys = _as_published(job.pipeline), job.cache, job.keys
     inputs = load_sequence_inputs(cache, keys, pipeline.object, pipeline.field, used)
-    scene = make_scene(cache, inputs.hand, object_records(inputs), mesh_blobs(keys.source.urdf), used.alias)
+    scene = make_scene(cache, inputs.hand, object_records(inputs), mesh_blobs(keys.source.urdf))
     inputs = job.with_sampler(replace(inputs, scene=scene))
     load_kernels(used.alias, kernel_modules(*job.kernels))
     assert job.simulate

@@ -111,7 +111,7 @@ def completed_object(
     return _model(seen.name, digest, seen.center.astype(float), points[order], normals[order], made, com, note)
 
 
-def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu") -> ObjectModel:
+def searched_object(whole: ObjectModel, params: ObjectParams) -> ObjectModel:
     """The model of a whole object as pipelines search it: about the middle of its box (but for stray points), contact
     points away from hollows and folds, in order, and what is opposite to each.
 
@@ -134,7 +134,7 @@ def searched_object(whole: ObjectModel, params: ObjectParams, device: str = "cpu
     touched = np.random.default_rng(params.seed).permutation(touched)[: params.contact_count]
     touched = touched[cluster_order(points[touched])]
     contacts, outward = (x[touched].astype(np.float32) for x in (points - middle, normals))
-    opposite = opposite_points(contacts, outward, seed=params.seed, device=device)
+    opposite = opposite_points(contacts, outward, seed=params.seed)
     if (opposite < 0).all():
         raise ObjectError(f"cloud '{whole.name}' shows no two sides to press on; add views of its other sides")
     moved = ("com", "sdf_origin", "obstacle_points", "cluster_center")

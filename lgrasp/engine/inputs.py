@@ -20,7 +20,7 @@ from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.model import HAND_VERSION, HandModel
-from lgrasp.hand.params import LISTED, HandParams
+from lgrasp.hand.params import LISTED, HandParams, ThumbBend
 from lgrasp.notices import notice
 from lgrasp.object.arrays import ObjectArrays, upload_object
 from lgrasp.object.find import find_object
@@ -138,10 +138,13 @@ def _object_key(path: Path, content: str, scale: float, params: ObjectParams) ->
 
 
 class Loader:
-    """Hands, objects and fields from the cache, or made and cached; ``report`` is called with (what, share done)."""
+    """Hands, objects and fields from the cache, or made and cached; ``report`` is called with (what, share done).
 
-    def __init__(self, cache: Cache, device: str = "cpu", report: Report | None = None) -> None:
-        self.cache, self.device = cache, device
+    All are made on the CPU, whatever the device of the job: rows do not depend on where they were made.
+    """
+
+    def __init__(self, cache: Cache, report: Report | None = None) -> None:
+        self.cache = cache
         self.report: Report = report or (lambda what, share: None)
         self.seconds: dict[str, float] = {}
         """By kind."""
@@ -159,12 +162,12 @@ class Loader:
 
                 bare = hands.model_copy(update={"sides": ()})
                 model = self.hand(source, hand_model_key(digest, bare), bare)
-                return sided_hand(source, model, hands.sides, self.device)
+                return sided_hand(source, model, hands.sides)
             if hands.contact_links == "all":
                 from lgrasp.hand.whole_hand import whole_hand
 
-                return whole_hand(source, self.hand(source, hand_model_key(digest)), self.device)
-            return build_hand(source.urdf, source.spec, self.device, decompose=partial(decompose, store=self.cache))
+                return whole_hand(source, self.hand(source, hand_model_key(digest)))
+            return build_hand(source.urdf, source.spec, decompose=partial(decompose, store=self.cache))
 
         return self.get("hand", HandModel, key, make)
 
@@ -172,7 +175,7 @@ class Loader:
         def make() -> ObjectModel:
             from lgrasp.object.preprocess import preprocess_object
 
-            model = preprocess_object(mesh, scale=scale, params=params, device=self.device)
+            model = preprocess_object(mesh, scale=scale, params=params)
             if _object_key(mesh, model.sha256, scale, params) != key:
                 raise ObjectError(f"object {mesh} was changed while it was read; run the command again")
             return model
@@ -187,11 +190,11 @@ class Loader:
         key = content_key("resting", RESTING_VERSION, object=key)
         return self.cache.get("resting", key, lambda: {"planes": resting_planes(obj)})[0]["planes"]
 
-    def field(self, hand: HandArrays, key: str, params: FieldParams) -> ContactField:
+    def field(self, hand: HandModel, key: str, params: FieldParams, thumb: ThumbBend | None = None) -> ContactField:
         def make() -> ContactField:
             from lgrasp.field.build import build_field
 
-            return build_field(hand, params, self.report)
+            return build_field(hand, params, self.report, thumb=thumb)
 
         return self.get("field", ContactField, key, make)
 
@@ -227,7 +230,7 @@ def load_inputs(
         ConfigError: something that this hand cannot do, or that this object does not have.
     """
     assert keys.mesh is not None
-    load, alias = Loader(cache, device.alias, report), device.alias
+    load, alias = Loader(cache, report), device.alias
     hand_model = load.hand(keys.source, keys.hand, keys.hands)
     touching = find_touching(steer, hand_model, keys.source.spec.fingers)
     object_model = load.object(keys.mesh, keys.object, scale, objects)
@@ -236,10 +239,10 @@ def load_inputs(
     if steer.touch or steer.avoid:
         from lgrasp.object.steered import steer_object, surface_weights  # slow to load
 
-        weights = surface_weights(object_model, steer.touch_regions, steer.avoid_regions, keys.mesh, device=alias)
-        left = steer_object(object_model, weights, seed=objects.seed, device=alias)
+        weights = surface_weights(object_model, steer.touch_regions, steer.avoid_regions, keys.mesh)
+        left = steer_object(object_model, weights, seed=objects.seed)
     hand = upload_hand(hand_model, alias, keys.hands.thumb)
-    field_model = load.field(hand, keys.field, fields)
+    field_model = load.field(hand_model, keys.field, fields, keys.hands.thumb)
     start = time.perf_counter()
     if steer.asks:
         field_model = steered_field(field_model, touching)

@@ -1,6 +1,7 @@
 """Hand -> ContactField: postures are drawn, the contact vectors that they make are sorted into voxels and boxes."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,13 @@ from lgrasp.field.kernels import Vectors, contact_vectors, sample_postures
 from lgrasp.field.model import ContactField
 from lgrasp.field.opposed import opposed_pairs
 from lgrasp.field.params import FieldParams
-from lgrasp.hand.arrays import HandArrays
+from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.hand.model import HandModel
+from lgrasp.hand.params import ThumbBend
 from lgrasp.math.transforms import NORMAL_BINS
+from lgrasp.runtime.cores import cores
 from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.ordered import in_order
 from lgrasp.runtime.structs import empty_struct
 
 
@@ -58,23 +62,29 @@ _PER_POSTURE = 4  # contact vectors drawn from one posture
 
 
 def build_field(
-    hand: HandArrays, params: FieldParams, progress: Callable[[str, float], None] | None = None
+    model: HandModel,
+    params: FieldParams,
+    progress: Callable[[str, float], None] | None = None,
+    *,
+    thumb: ThumbBend | None = None,
 ) -> ContactField:
     """Sample and index the contact field of a hand (Def. 4.2); groups without contact surface have no vectors.
 
     Args:
         progress: called with (what, share done).
+        thumb: how the thumb stands in all postures.
 
     Raises:
         HandError: a group that no posture frees from the palm.
     """
-    parts, groups = [], hand.model.groups
-    slots = hand.model.surfaces * len(hand.model.tree.settings) * groups
-    for slot in range(slots):
+    parts, groups = [], model.groups
+    hand = upload_hand(model, "cpu", thumb)
+    slots = model.surfaces * len(model.tree.settings) * groups
+    for slot, part in in_order(partial(_sample_slot, hand, params), range(slots), cores()):
+        parts.append(part)
         if progress:
-            progress(f"group {slot + 1} of {slots}", slot / slots)
-        parts.append(_sample_slot(hand, slot, params))
-    _check_clear(hand.model, np.array([p["clear"] for p in parts]).reshape(-1, groups))
+            progress(f"group {slot + 1} of {slots}", (slot + 1) / slots)
+    _check_clear(model, np.array([p["clear"] for p in parts]).reshape(-1, groups))
     cell = _bounded_cell([p["position"] for p in parts], params)
     origins, shapes, keys, base = [], [], [], 0
     for p in parts:
@@ -102,16 +112,16 @@ def build_field(
     def gather(name: str, dtype) -> np.ndarray:
         return np.concatenate([p[name] for p in parts])[order].astype(dtype)
 
-    index = np.arange(*hand.model.contact_first[groups : groups + 2])
-    palm = {"position": hand.model.contact_points[index], "direction": hand.model.contact_normals[index]}
+    index = np.arange(*model.contact_first[groups : groups + 2])
+    palm = {"position": model.contact_points[index], "direction": model.contact_normals[index]}
     palm["index"] = index
     position, point = gather("position", np.float32), gather("point", np.int32)
     setting = np.repeat(np.arange(slots) // groups, [len(p["point"]) for p in parts])[order]
-    patch = setting * hand.model.patches + hand.model.contact_patch[point]
-    indices: dict[str, Any] = box_index(position, patch, slots // groups * hand.model.patches, params)
+    patch = setting * model.patches + model.contact_patch[point]
+    indices: dict[str, Any] = box_index(position, patch, slots // groups * model.patches, params)
     indices |= opposed_pairs(parts, groups, palm, params.seed)
     return ContactField(
-        hand_sha256=hand.model.sha256,
+        hand_sha256=model.sha256,
         cell=cell,
         origin=np.array(origins, np.float32),
         shape=np.array(shapes, np.int32),
@@ -148,9 +158,9 @@ def _check_clear(model: HandModel, clear: np.ndarray) -> None:
         )
 
 
-def _sample_slot(hand: HandArrays, slot: int, params: FieldParams) -> dict[str, np.ndarray]:
+def _sample_slot(hand: HandArrays, params: FieldParams, slot: int) -> dict[str, np.ndarray]:
     """Contact vectors of a group in a setting; none when it has no contact surface, or no posture is clear."""
-    model, device = hand.model, hand.device
+    model, device = hand.model, "cpu"
     settings = len(model.tree.settings)
     setting, group = divmod(slot, model.groups)
     # vectors may fill half of the memory bound, the table the rest

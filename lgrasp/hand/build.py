@@ -29,12 +29,11 @@ _SAMPLE_SPACING = 4.0e-3  # [m]
 def build_hand(
     urdf_path: Path,
     spec: HandSpec,
-    device: str = "cpu",
     *,
     decompose: Decompose | None = None,
     pieces_only: bool = False,
 ) -> HandModel:
-    """Build a HandModel from a URDF and its rules; ``device`` answers the geometric queries.
+    """Build a HandModel from a URDF and its rules.
 
     Args:
         decompose: cuts dented collision bodies into convex pieces; without it their hulls are taken.
@@ -51,9 +50,9 @@ def build_hand(
     check_contact_links(spec, tree.link_names, dict(urdf.links))
     check_spaces(spec, tree, dict(urdf.links))
     rng = np.random.default_rng(0)
-    solids = _Solids(urdf, tree, None if pieces_only else rng, decompose, device)
-    links = [] if pieces_only else _contact_links(spec, tree, solids.meshes, rng, device)
-    contacts = contact_arrays(tree, links, solids.meshes, rng, device)
+    solids = _Solids(urdf, tree, None if pieces_only else rng, decompose)
+    links = [] if pieces_only else _contact_links(spec, tree, solids.meshes, rng)
+    contacts = contact_arrays(tree, links, solids.meshes, rng)
     model = HandModel(
         name=spec.name,
         sha256=urdf_digest(urdf, spec),
@@ -68,7 +67,7 @@ def build_hand(
         **solids.arrays(),
         **contacts,
     )
-    return with_pairs(model, {(j.parent, j.child) for j in urdf.joints}, solids.meshes, solids.dented, device)
+    return with_pairs(model, {(j.parent, j.child) for j in urdf.joints}, solids.meshes, solids.dented)
 
 
 class _Solids:
@@ -77,9 +76,7 @@ class _Solids:
     Without ``rng`` there are no spheres and no samples.
     """
 
-    def __init__(
-        self, urdf: Urdf, tree: Tree, rng: np.random.Generator | None, decompose: Decompose | None, device: str
-    ) -> None:
+    def __init__(self, urdf: Urdf, tree: Tree, rng: np.random.Generator | None, decompose: Decompose | None) -> None:
         self.meshes: dict[str, list[trimesh.Trimesh]] = {}
         self.notes: list[str] = []
         self.dented: set[str] = set()
@@ -92,7 +89,7 @@ class _Solids:
             for geometry in urdf.links[link]:
                 T = tree.T_body_link[index] @ geometry.T_link_geometry
                 mesh = geometry_mesh(urdf, geometry)
-                pieces, note = convex_pieces(urdf, geometry, mesh, decompose, device)
+                pieces, note = convex_pieces(urdf, geometry, mesh, decompose)
                 if note:
                     self.notes.append(f"link '{link}': {note}")
                     self.dented.add(link)
@@ -148,7 +145,6 @@ def _contact_links(
     tree: Tree,
     meshes: Mapping[str, Sequence[trimesh.Trimesh]],
     rng: np.random.Generator,
-    device: str,
 ) -> list[ContactLink]:
     """Contact surface of the links that the rules name, palm links last."""
     out = []
@@ -159,7 +155,7 @@ def _contact_links(
         if group < 0 and not palm:
             raise HandError(f"hand '{spec.name}': contact link '{link}' does not move; list it under palm")
         T = tree.T_body_link[tree.link_names.index(link)]
-        points, normals = link_points(meshes[link], T, cones, rng, device, palm=palm)
+        points, normals = link_points(meshes[link], T, cones, rng, palm=palm)
         if len(points) == 0 and not palm:
             raise HandError(f"hand '{spec.name}': the forbidden cones leave no surface on contact link '{link}'")
         rules = body_cones(() if palm else cones, T)

@@ -35,15 +35,15 @@ def grid_arrays(grids: Sequence[SdfGrid], prefix: str = "") -> dict[str, np.ndar
     return {f"{prefix}grid_{name}": array for name, array in arrays.items()}
 
 
-def link_grid(meshes: Sequence[trimesh.Trimesh], device: str) -> SdfGrid:
+def link_grid(meshes: Sequence[trimesh.Trimesh]) -> SdfGrid:
     """Distance grid of the union of a link's solids (already in the body frame)."""
     low = np.min([m.bounds[0] for m in meshes], 0) - _GRID_PAD
     high = np.max([m.bounds[1] for m in meshes], 0) + _GRID_PAD
-    return box_grid(meshes, low, high, max(_GRID_CELL, float((high - low).max()) / 80), device)
+    return box_grid(meshes, low, high, max(_GRID_CELL, float((high - low).max()) / 80))
 
 
 def box_grid(
-    meshes: Sequence[trimesh.Trimesh], low: np.ndarray, high: np.ndarray, cell: float, device: str, **sign: bool
+    meshes: Sequence[trimesh.Trimesh], low: np.ndarray, high: np.ndarray, cell: float, **sign: bool
 ) -> SdfGrid:
     """Distance grid of the union of solids in a box with corners (3,) [m]; ``sign`` as of :func:`signed_distance`."""
     shape = np.ceil((high - low) / cell).astype(int) + 1
@@ -54,7 +54,7 @@ def box_grid(
     for own in (True, False):  # of each point first the solid of the nearest box, then those that may be nearer
         for number, mesh in enumerate(meshes):
             rows = np.flatnonzero(((nearest == number) == own) & (boxes[number] <= values + _ROUNDING))
-            values[rows] = np.minimum(values[rows], signed_distance(mesh, points[rows], device, **sign))
+            values[rows] = np.minimum(values[rows], signed_distance(mesh, points[rows], **sign))
     return SdfGrid(values.reshape(shape), low.astype(np.float32), cell)
 
 
@@ -75,7 +75,6 @@ def link_points(
     T_body_link: np.ndarray,
     cones: tuple[Cone, ...],
     rng: np.random.Generator,
-    device: str = "cpu",
     *,
     palm: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +88,7 @@ def link_points(
     inside = np.zeros(len(points), bool)
     for cone in cones:
         inside |= in_cone(normals @ T_body_link[:3, :3], cone)
-    free = _free(meshes, points, normals, _SURFACE if palm else (*_SURFACE, (8e-3, 5e-3), (2e-2, 1.9e-2)), device)
+    free = _free(meshes, points, normals, _SURFACE if palm else (*_SURFACE, (8e-3, 5e-3), (2e-2, 1.9e-2)))
     return _thin(points, normals, free & (inside if palm else ~inside), rng)
 
 
@@ -99,7 +98,6 @@ def side_points(
     T_body_link: np.ndarray,
     surface: Surface,
     rng: np.random.Generator,
-    device: str,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Points and normals (n, 3) of a link's part of one side of an opposition space, body frame, and its area [m^2].
 
@@ -118,7 +116,7 @@ def side_points(
         local = (points - t) @ R
         keep &= ((local >= surface.box.min) & (local <= surface.box.max)).all(1)
     points, normals = points[keep], normals[keep]
-    keep = _free(around, points, normals, (*_SURFACE, (8e-3, 5e-3), (2e-2, 1.8e-2)), device)
+    keep = _free(around, points, normals, (*_SURFACE, (8e-3, 5e-3), (2e-2, 1.8e-2)))
     kept = float(keep.sum() * area / sum(shares))
     return *_thin(points, normals, keep, rng, int(np.clip(kept / _SIDE_AREA, *_SIDE_POINTS))), kept
 
@@ -140,7 +138,6 @@ def _free(
     points: np.ndarray,
     normals: np.ndarray,
     probes: tuple[tuple[float, float], ...],
-    device: str,
 ) -> np.ndarray:
     """(n,) bool: is every place ``probe`` [m] above a point farther than ``least`` [m] from a link's solids?"""
     free = np.ones(len(points), bool)
@@ -148,7 +145,7 @@ def _free(
         places = points + probe * normals
         for mesh in meshes:
             near = np.flatnonzero(free & (_box_distance(mesh, places) <= least + _ROUNDING))
-            free[near] = signed_distance(mesh, places[near], device) > least
+            free[near] = signed_distance(mesh, places[near]) > least
     return free
 
 

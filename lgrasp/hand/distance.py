@@ -33,9 +33,7 @@ def mesh_distance(
     distance_out[i] = sign * wp.length(points[i] - p)
 
 
-def signed_distance(
-    mesh: trimesh.Trimesh, points: np.ndarray, device: str = "cpu", *, winding: bool = False
-) -> np.ndarray:
+def signed_distance(mesh: trimesh.Trimesh, points: np.ndarray, *, winding: bool = False) -> np.ndarray:
     """Signed distances (n,) [m] of points (n, 3) to a mesh, negative inside.
 
     Args:
@@ -45,11 +43,11 @@ def signed_distance(
         return np.zeros(0, np.float32)
     start()
     handle = wp.Mesh(
-        wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device=device),
-        wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device=device),
+        wp.array(np.asarray(mesh.vertices, np.float32), dtype=wp.vec3, device="cpu"),
+        wp.array(np.asarray(mesh.faces, np.int32).ravel(), dtype=wp.int32, device="cpu"),
         support_winding_number=winding,
     )
-    out = wp.empty(len(points), dtype=wp.float32, device=device)
-    queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device=device)
-    wp.launch(mesh_distance, dim=len(points), inputs=[handle.id, queries, winding], outputs=[out], device=device)
+    out = wp.empty(len(points), dtype=wp.float32, device="cpu")
+    queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device="cpu")
+    wp.launch(mesh_distance, dim=len(points), inputs=[handle.id, queries, winding], outputs=[out], device="cpu")
     return to_numpy(out)

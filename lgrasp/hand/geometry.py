@@ -181,7 +181,7 @@ def _hull_piece(points: np.ndarray) -> Piece:
 
 
 def convex_pieces(
-    urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh, decompose: Decompose | None = None, device: str = "cpu"
+    urdf: Urdf, geometry: Geometry, mesh: trimesh.Trimesh, decompose: Decompose | None = None
 ) -> tuple[list[Piece], str]:
     """Convex pieces of one collision element, and in words how they differ from it ("": hardly).
 
@@ -201,7 +201,7 @@ def convex_pieces(
             raise
         # a flat part: its hull has no volume, that of the whole may
         bodies, hulls = [mesh], [convex_piece(urdf, geometry, mesh)]
-    dented = [is_dented(body, device) for body in bodies]
+    dented = [is_dented(body) for body in bodies]
     if not any(dented):
         return hulls, ""
     share = 100 * abs(mesh.volume) / sum(hull.hull_volume for hull in hulls)
@@ -219,9 +219,7 @@ def convex_pieces(
     return pieces, note + (f" ({failures[0]})" if failures else "")
 
 
-def link_pieces(
-    urdf: Urdf, link: str, decompose: Decompose | None = None, device: str = "cpu"
-) -> tuple[list[Piece], list[str]]:
+def link_pieces(urdf: Urdf, link: str, decompose: Decompose | None = None) -> tuple[list[Piece], list[str]]:
     """Convex pieces of a link in its own frame [m], and in words how they differ from its collision elements.
 
     Raises:
@@ -229,13 +227,13 @@ def link_pieces(
     """
     found, notes = [], []
     for geometry in urdf.links[link]:
-        pieces, note = convex_pieces(urdf, geometry, geometry_mesh(urdf, geometry), decompose, device)
+        pieces, note = convex_pieces(urdf, geometry, geometry_mesh(urdf, geometry), decompose)
         found += [piece.moved(geometry.T_link_geometry) for piece in pieces]
         notes += [f"link '{link}': {note}"] if note else []
     return found, notes
 
 
-def is_dented(body: trimesh.Trimesh, device: str = "cpu") -> bool:
+def is_dented(body: trimesh.Trimesh) -> bool:
     """True if a body differs from its hull by a tenth of its volume, and by 4 mm somewhere.
 
     Raises:
@@ -246,7 +244,7 @@ def is_dented(body: trimesh.Trimesh, device: str = "cpu") -> bool:
         return False
     shell = trimesh.Trimesh(hull.points, hull.simplices, process=False)
     points = trimesh.sample.sample_surface(shell, 2000, seed=0)[0]
-    return bool(np.abs(signed_distance(body, points, device)).max() > _MAX_DENT)
+    return bool(np.abs(signed_distance(body, points)).max() > _MAX_DENT)
 
 
 def _cut(body: trimesh.Trimesh, decompose: Decompose, most: int) -> list[Piece]:

@@ -61,7 +61,6 @@ def _side(
     meshes: Sequence[trimesh.Trimesh],
     grid_meshes: Sequence[trimesh.Trimesh],
     T: np.ndarray,
-    device: str,
 ) -> OverlapSide | None:
     """Points of ``meshes`` against a grid of ``grid_meshes``; T (N, 4, 4) takes the points' body to the grid's."""
     points = _surface(meshes)
@@ -80,7 +79,7 @@ def _side(
     box_low, box_high = box_low - _GRID_PAD, box_high + _GRID_PAD
     cell = max(_MIN_CELL, float(np.prod(box_high - box_low) / _MAX_CELLS) ** (1 / 3))
     holes = not all(m.is_watertight for m in grid_meshes)
-    grid = box_grid(list(grid_meshes), box_low, box_high, cell, device, winding=holes)
+    grid = box_grid(list(grid_meshes), box_low, box_high, cell, winding=holes)
     depth, often, deepest = np.zeros(len(T)), np.zeros(len(points)), np.zeros(len(points))
     for i, M in enumerate(T):
         sunk = np.maximum(0.0, -_lookup(grid, points @ M[:3, :3].T + M[:3, 3]))
@@ -95,7 +94,6 @@ def overlap_sides(
     bodies: tuple[int, int],
     meshes: tuple[Sequence[trimesh.Trimesh], Sequence[trimesh.Trimesh]],
     T_base: tuple[np.ndarray, np.ndarray],
-    device: str = "cpu",
 ) -> list[OverlapSide]:
     """Both sides of a link pair, those without a point that sinks in left out.
 
@@ -106,8 +104,8 @@ def overlap_sides(
     """
     T_ab = np.linalg.inv(T_base[0]) @ T_base[1]  # b in a
     found = [
-        _side(bodies[1], bodies[0], meshes[1], meshes[0], T_ab, device),
-        _side(bodies[0], bodies[1], meshes[0], meshes[1], np.linalg.inv(T_ab), device),
+        _side(bodies[1], bodies[0], meshes[1], meshes[0], T_ab),
+        _side(bodies[0], bodies[1], meshes[0], meshes[1], np.linalg.inv(T_ab)),
     ]
     return [side for side in found if side is not None and len(side.points)]
 

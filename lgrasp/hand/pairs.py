@@ -51,27 +51,23 @@ def mark_touching(
         touch_out[row, k] = 1
 
 
-def pieces_touch(
-    model: HandModel, q: np.ndarray, pairs: np.ndarray, margin: float = 0.0, device: str = "cpu"
-) -> np.ndarray:
+def pieces_touch(model: HandModel, q: np.ndarray, pairs: np.ndarray, margin: float = 0.0) -> np.ndarray:
     """(N, Q) bool: are piece pairs (Q, 2) within ``margin`` [m] of each other at postures q (N, K)?"""
-    hand = upload_hand(model, device)
-    return placed_pieces_touch(hand.struct.pieces, body_poses(hand, q), pairs, margin, device)
+    hand = upload_hand(model, "cpu")
+    return placed_pieces_touch(hand.struct.pieces, body_poses(hand, q), pairs, margin)
 
 
-def placed_pieces_touch(
-    pieces: Pieces, pose: np.ndarray, pairs: np.ndarray, margin: float = 0.0, device: str = "cpu"
-) -> np.ndarray:
+def placed_pieces_touch(pieces: Pieces, pose: np.ndarray, pairs: np.ndarray, margin: float = 0.0) -> np.ndarray:
     """As :func:`pieces_touch`, of pieces on the device, with their bodies at device poses (N, B, 7)."""
     start()
-    out = wp.zeros((len(pose), len(pairs)), dtype=wp.int32, device=device)
+    out = wp.zeros((len(pose), len(pairs)), dtype=wp.int32, device="cpu")
     inputs = [
         pieces,
-        wp.array(pose, dtype=wp.transform, device=device),
-        wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device=device),
+        wp.array(pose, dtype=wp.transform, device="cpu"),
+        wp.array(np.asarray(pairs, np.int32), dtype=wp.vec2i, device="cpu"),
         float(margin),
     ]
-    wp.launch(mark_touching, dim=out.shape, inputs=inputs, outputs=[out], device=device)
+    wp.launch(mark_touching, dim=out.shape, inputs=inputs, outputs=[out], device="cpu")
     return to_numpy(out).astype(bool)
 
 
@@ -98,7 +94,6 @@ def with_pairs(
     adjacent: set[tuple[str, str]],
     meshes: Mapping[str, Sequence[trimesh.Trimesh]],
     dented: set[str],
-    device: str,
 ) -> HandModel:
     """The model with its self-collision pairs, grouped by (group a, group b).
 
@@ -117,7 +112,7 @@ def with_pairs(
     swapped = group[model.piece_body[pairs[:, 0]]] > group[model.piece_body[pairs[:, 1]]]
     pairs[swapped] = pairs[swapped, ::-1]
     q = model.random_postures(PAIR_POSTURES, 1)
-    touch = pieces_touch(model, q, pairs, device=device)
+    touch = pieces_touch(model, q, pairs)
     # links, not pieces, are what touches: a link pair is left out when some pieces of it touch in every posture
     links = np.sort(model.piece_link[pairs], axis=1)
     keep = np.ones(len(pairs), bool)
@@ -129,16 +124,14 @@ def with_pairs(
         a, b = (names[k] for k in pair)
         if share > ALMOST_ALWAYS and (a in dented or b in dented):
             keep[members] = False
-            found, note = _true_overlap(model, (a, b), meshes, q, device)
+            found, note = _true_overlap(model, (a, b), meshes, q)
             sides += found
             body_a, body_b = sorted(int(group[model.tree.link_body[k]]) for k in pair)
             keys += [body_a * groups + body_b] * len(found)
             notes += [note] if note else []
         elif (
             share == 1.0
-            and pieces_touch(model, model.random_postures(_CONFIRMING_POSTURES, 1), pairs[members], device=device)
-            .any(1)
-            .all()
+            and pieces_touch(model, model.random_postures(_CONFIRMING_POSTURES, 1), pairs[members]).any(1).all()
         ):
             keep[members] = False
     pairs = pairs[keep]
@@ -150,17 +143,17 @@ def with_pairs(
 
 
 def _true_overlap(
-    model: HandModel, pair: tuple[str, str], meshes: Mapping[str, Sequence[trimesh.Trimesh]], q: np.ndarray, device: str
+    model: HandModel, pair: tuple[str, str], meshes: Mapping[str, Sequence[trimesh.Trimesh]], q: np.ndarray
 ) -> tuple[list[OverlapSide], str]:
     """Both sides of a link pair's test on the true surfaces, none when it is pointless, and what to tell the user."""
     bodies = (model.tree.body_of(pair[0]), model.tree.body_of(pair[1]))
-    hand = upload_hand(model, device)
+    hand = upload_hand(model, "cpu")
 
     def placed(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         poses = body_poses(hand, q).astype(float)
         return device_matrix(poses[:, bodies[0]]), device_matrix(poses[:, bodies[1]])
 
-    sides = overlap_sides(bodies, (meshes[pair[0]], meshes[pair[1]]), placed(q), device)
+    sides = overlap_sides(bodies, (meshes[pair[0]], meshes[pair[1]]), placed(q))
     if not sides:
         return [], ""
     depth = np.max([side.depth for side in sides], 0)

@@ -44,12 +44,12 @@ class Postures:
         return p + t, n
 
 
-def sample_bodies(model: HandModel, q: np.ndarray, device: str = "cpu") -> Postures:
+def sample_bodies(model: HandModel, q: np.ndarray) -> Postures:
     """Body poses at postures q (N, K), and which of them are clear."""
     start()
-    poses = body_poses(upload_hand(model, device), q)
+    poses = body_poses(upload_hand(model, "cpu"), q)
     R = device_rotation(poses.reshape(-1, 7)).as_matrix().reshape(*poses.shape[:2], 3, 3)
-    touch = pieces_touch(model, q, model.pairs, device=device)
+    touch = pieces_touch(model, q, model.pairs)
     group = model.tree.body_group[model.piece_body[model.pairs]]  # (Q, 2), the base is -1
     own = [(group[:, 1] == g) & ((group[:, 0] == -1) | (group[:, 0] == g)) for g in range(model.groups)]
     clear = np.stack([~touch[:, pairs].any(1) for pairs in own], 1)

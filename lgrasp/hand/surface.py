@@ -59,7 +59,6 @@ def contact_arrays(
     links: Sequence[ContactLink],
     meshes: Mapping[str, list[trimesh.Trimesh]],
     rng: np.random.Generator,
-    device: str,
     *,
     known: Mapping[str, SdfGrid] | None = None,
 ) -> dict[str, np.ndarray]:
@@ -74,7 +73,7 @@ def contact_arrays(
         # fingertips of one shape share one grid's work
         key = b"".join(np.round(m.vertices, 9).tobytes() for m in meshes[entry.link])
         grid = (known or {}).get(entry.link) or made.get(key)
-        grids.append(grid or made.setdefault(key, link_grid(meshes[entry.link], device)))
+        grids.append(grid or made.setdefault(key, link_grid(meshes[entry.link])))
     joined = [outer_mesh(meshes[entry.link]) for entry in links]
     # grids in the order given, points group by group
     order = sorted(range(len(links)), key=lambda i: links[i].group)

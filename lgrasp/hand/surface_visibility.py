@@ -40,7 +40,7 @@ def link_surfaces(urdf: Urdf, model: HandModel) -> list[SurfaceSamples]:
 
 
 def surface_visibility(
-    surfaces: list[SurfaceSamples], postures: Postures, tips: dict[int, np.ndarray], device: str = "cpu"
+    surfaces: list[SurfaceSamples], postures: Postures, tips: dict[int, np.ndarray]
 ) -> list[SurfaceSamples]:
     """The surfaces with the share of postures at which the mean fingertip sees each point.
 
@@ -57,30 +57,30 @@ def surface_visibility(
     handle = None
     for row in chosen:
         placed = postures.place(row, body, whole.vertices)
-        world = wp.array(placed.astype(np.float32), dtype=wp.vec3, device=device)
+        world = wp.array(placed.astype(np.float32), dtype=wp.vec3, device="cpu")
         if handle is None:
-            handle = wp.Mesh(world, wp.array(whole.faces.ravel().astype(np.int32), dtype=wp.int32, device=device))
+            handle = wp.Mesh(world, wp.array(whole.faces.ravel().astype(np.int32), dtype=wp.int32, device="cpu"))
         else:
             wp.copy(handle.points, world)
             handle.refit()
         eye = np.mean([postures.R[row, b] @ p + postures.t[row, b] for b, p in tips.items()], 0)
         target, out = postures.put(row, point_body, points, normals)
         facing = np.flatnonzero(np.einsum("ni,ni->n", out, eye - target) > 0)
-        free = wp.empty(len(facing), dtype=wp.int32, device=device)
-        targets = wp.array(target[facing].astype(np.float32), dtype=wp.vec3, device=device)
-        wp.launch(first_hits, len(facing), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device=device)
+        free = wp.empty(len(facing), dtype=wp.int32, device="cpu")
+        targets = wp.array(target[facing].astype(np.float32), dtype=wp.vec3, device="cpu")
+        wp.launch(first_hits, len(facing), [handle.id, wp.vec3(*map(float, eye)), targets, 3e-4], [free], device="cpu")
         seen[facing] += to_numpy(free) == 1
     parts = np.split(seen / len(chosen), np.cumsum([len(s.points) for s in surfaces])[:-1])
     return [replace(s, seen=part) for s, part in zip(surfaces, parts, strict=True)]
 
 
-def visible_surface(source: HandSource, model: HandModel, device: str = "cpu") -> ContactSurface:
+def visible_surface(source: HandSource, model: HandModel) -> ContactSurface:
     """The palmar side of a hand: what the mean fingertip sees. A ray from there meets it first, in three of ten random
     postures or more."""
     surfaces = link_surfaces(read_urdf(source.urdf), model)
     tips = {b: tip_point([s for s in surfaces if s.body == b], 0.1) for b in last_bodies(model)}
-    postures = sample_bodies(model, model.random_postures(_SAMPLED_POSTURES), device)
-    seen = surface_visibility(surfaces, postures, tips, device)
+    postures = sample_bodies(model, model.random_postures(_SAMPLED_POSTURES))
+    seen = surface_visibility(surfaces, postures, tips)
     chosen = [s.seen >= _MIN_SEEN_SHARE for s in seen]
     link = np.repeat([model.tree.link_names.index(s.link) for s in seen], [int(c.sum()) for c in chosen])
     points, normals = (

@@ -19,17 +19,17 @@ _MOST_POINTS = 160  # of a finger link
 _PALMAR_COSINE = np.cos(np.radians(80.0))  # to the axis away from the palmar side, above which a normal is not palmar
 
 
-def whole_hand(source: HandSource, model: HandModel, device: str) -> HandModel:
+def whole_hand(source: HandSource, model: HandModel) -> HandModel:
     """The same hand, whose other finger links may touch too: with the side that the mean fingertip sees.
 
     Links that hand.yaml lists keep their surface. Of the others a contact may slide wherever the normal is within 100
     degrees of the mean of the side's.
 
     Args:
-        source: what ``model`` was built from. device: answers the geometric queries.
+        source: what ``model`` was built from.
     """
     tree, urdf, links = model.tree, read_urdf(source.urdf), listed_links(model)
-    side = visible_surface(source, model, device)
+    side = visible_surface(source, model)
     for link in np.setdiff1d(side.link, model.grid_link):
         name, own = tree.link_names[link], side.link == link
         if tree.group_of(name) >= 0 and own.sum() >= _LEAST_POINTS:
@@ -42,15 +42,15 @@ def whole_hand(source: HandSource, model: HandModel, device: str) -> HandModel:
     for k, link in enumerate(links):
         if link.group < tree.groups:
             links[k] = replace(link, points=link.points[:_MOST_POINTS], normals=link.normals[:_MOST_POINTS])
-    return replace(model, **surface_arrays(model, urdf, links, device))
+    return replace(model, **surface_arrays(model, urdf, links))
 
 
-def palmar_hand(source: HandSource, model: HandModel, side: ContactSurface, device: str) -> HandModel:
+def palmar_hand(source: HandSource, model: HandModel, side: ContactSurface) -> HandModel:
     """The same hand with distance grids and meshes of all links of a palmar side, so that contacts there are measured
     as those of the links that hand.yaml lists.
 
     Args:
-        source: what ``model`` was built from. device: answers the geometric queries.
+        source: what ``model`` was built from.
     """
     tree = model.tree
     links = []
@@ -59,7 +59,7 @@ def palmar_hand(source: HandSource, model: HandModel, side: ContactSurface, devi
         links.append(ContactLink(name, tree.surface_of(name), side.points[own], side.normals[own], np.empty((0, 4))))
     if not links:
         return model
-    others = surface_arrays(model, read_urdf(source.urdf), links, device)
+    others = surface_arrays(model, read_urdf(source.urdf), links)
     return replace(model, **with_bare_links({name: getattr(model, name) for name in others}, others))
 
 
@@ -74,10 +74,10 @@ def listed_links(model: HandModel) -> list[ContactLink]:
     return found
 
 
-def surface_arrays(model: HandModel, urdf: Urdf, links: Sequence[ContactLink], device: str) -> dict[str, np.ndarray]:
+def surface_arrays(model: HandModel, urdf: Urdf, links: Sequence[ContactLink]) -> dict[str, np.ndarray]:
     """What a hand has of its contact surface, if these are all links that may touch; known grids are taken over."""
     names, parts = model.tree.link_names, np.split(model.grid_values, model.grid_first[1:-1])
     rows = zip(model.grid_link, parts, model.grid_shape, model.grid_origin, model.grid_cell, strict=True)
     known = {names[k]: SdfGrid(part.reshape(shape), origin, float(cell)) for k, part, shape, origin, cell in rows}
     meshes = {link.link: link_meshes(urdf, model.tree, link.link) for link in links}
-    return contact_arrays(model.tree, links, meshes, np.random.default_rng(0), device, known=known)
+    return contact_arrays(model.tree, links, meshes, np.random.default_rng(0), known=known)

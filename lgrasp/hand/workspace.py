@@ -37,7 +37,7 @@ class Workspace:
 
 def measure_workspace(model: HandModel) -> Workspace:
     """The workspace of a hand, from 4096 random postures."""
-    postures = sample_bodies(model, model.random_postures(_POSTURES), "cpu")
+    postures = sample_bodies(model, model.random_postures(_POSTURES))
     reached = []
     for group in range(model.groups):
         first, end = model.contact_first[group : group + 2]

@@ -66,4 +66,4 @@ def whole_object(cloud: Cloud, name: str, networks: Networks, params: ObjectPara
     target = cloud.only(cloud.target)
     seen = cloud_object(target.points, target.normals, name=name)
     whole = CloudCompletion(networks, seen.contact_points, seen.contact_normals, device).completed(seen)
-    return searched_object(whole, params, device)
+    return searched_object(whole, params)

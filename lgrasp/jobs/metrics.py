@@ -145,7 +145,7 @@ class MetricsJob(MetricsRequest, ShardJob):
         assert part.source is not None
         shard, device = read_shard(part.source), self.device_used
         hand = arrays_of_shard(self.cache, shard.hand, shard.header.config, device)
-        obj = upload_object(object_of_shard(self.cache, shard.objects[0], device), device.alias)
+        obj = upload_object(object_of_shard(self.cache, shard.objects[0]), device.alias)
         return try_rows(hand, obj, test, shard.grasps, shard.header.seed, workers=workers, progress=progress)
 
 

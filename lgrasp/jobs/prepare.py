@@ -9,18 +9,16 @@ import numpy as np
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.inputs import Loader, input_keys, object_key
 from lgrasp.field.params import FieldParams
-from lgrasp.hand.arrays import upload_hand
 from lgrasp.jobs.hands import hand_source
 from lgrasp.object.find import find_object
 from lgrasp.object.load import load_mesh
 from lgrasp.object.mass import mass_properties
 from lgrasp.object.params import ObjectParams
-from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.device import start as start_warp
 
 
 def prepare_field(
-    cache: Cache, hand: str, params: FieldParams, *, device: str, report: Callable[[str, float], None] | None
+    cache: Cache, hand: str, params: FieldParams, *, report: Callable[[str, float], None] | None
 ) -> dict[str, Any]:
     """Build the contact field of a hand (or find it in the cache) and describe it.
 
@@ -28,14 +26,14 @@ def prepare_field(
         report: called with (what, share done).
 
     Raises:
-        HandError, DeviceError: bad input.
+        HandError: bad input.
     """
-    where = resolve_device(device)
+    start_warp()
     keys = input_keys(hand_source(hand), None, 1.0, ObjectParams(), params)
     start = time.perf_counter()
-    load = Loader(cache, where.alias, report)
+    load = Loader(cache, report)
     model = load.hand(keys.source, keys.hand)
-    field = load.field(upload_hand(model, where.alias), keys.field, params)
+    field = load.field(model, keys.field, params)
     clear = field.clear_share.reshape(-1, model.groups).mean(0)
     return {
         "hand": model.name,
@@ -53,7 +51,6 @@ def prepare_field(
         "clear_share": [None if np.isnan(share) else float(share) for share in clear],
         "seconds": time.perf_counter() - start,
         "cached": load.hits["field"],
-        "device": where.name,
         "file": _file(cache, "field", keys.field),
     }
 

@@ -90,10 +90,8 @@ def cutter(cache: Cache, events: Events | None = None, progress: PartProgress | 
     return partial(decompose, store=cache, tell=tell)
 
 
-def make_scene(
-    cache: Cache, hand: HandModel, objects: Sequence[ObjectRecord], meshes: dict[str, bytes], device: str
-) -> "Scene":
+def make_scene(cache: Cache, hand: HandModel, objects: Sequence[ObjectRecord], meshes: dict[str, bytes]) -> "Scene":
     """What the simulator is given: the scene of the job's shards; ``meshes`` are the hand's :func:`mesh_blobs`."""
     from lgrasp.simulate.scene import scene_of
 
-    return scene_of(hand_record(hand, meshes), objects, cutter(cache), device)
+    return scene_of(hand_record(hand, meshes), objects, cutter(cache))

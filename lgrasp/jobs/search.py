@@ -81,7 +81,7 @@ class SearchJob(SearchRequest, Job):
         self._meshes = mesh_blobs(self.keys.source.urdf)
         if missing and self.protocol:
             events.loading("scene")
-            scene = make_scene(self.cache, *self.records(inputs), self._meshes, self.device_used.alias)
+            scene = make_scene(self.cache, *self.records(inputs), self._meshes)
             inputs = replace(inputs, scene=scene)
         self._inputs = inputs
 

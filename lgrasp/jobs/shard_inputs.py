@@ -38,7 +38,7 @@ from lgrasp.paths import user_path
 from lgrasp.runtime.device import Device
 
 
-def named_hand(cache: Cache, name: str, device: Device) -> tuple[HandSource, HandModel]:
+def named_hand(cache: Cache, name: str) -> tuple[HandSource, HandModel]:
     """A hand by name, folder or URDF (see :func:`hand_source`), or that of a shard (*.h5); cached.
 
     Raises:
@@ -46,17 +46,17 @@ def named_hand(cache: Cache, name: str, device: Device) -> tuple[HandSource, Han
     """
     if name.endswith(".h5"):
         with ShardReader(user_path(name)) as reader:
-            return hand_of_shard(cache, reader.hand(), reader.header.config, device)
-    return _built(cache, hand_source(name), device)
+            return hand_of_shard(cache, reader.hand(), reader.header.config)
+    return _built(cache, hand_source(name))
 
 
-def palmar_side(cache: Cache, source: HandSource, hand: HandModel, device: Device) -> tuple[HandModel, ContactSurface]:
+def palmar_side(cache: Cache, source: HandSource, hand: HandModel) -> tuple[HandModel, ContactSurface]:
     """What touches in plans: the hand with meshes of all links of its palmar side
     (:func:`~lgrasp.hand.whole_hand.palmar_hand`), and the side; cached."""
 
     def make() -> dict[str, np.ndarray]:
-        side = visible_surface(source, hand, device.alias)
-        whole = palmar_hand(source, hand, side, device.alias)
+        side = visible_surface(source, hand)
+        whole = palmar_hand(source, hand, side)
         return {**side._asdict(), **{name: getattr(whole, name) for name in LINK_ARRAYS}}
 
     arrays = cache.get("palmar", content_key("palmar", PALMAR_VERSION, hand=hand.sha256), make)[0]
@@ -64,9 +64,7 @@ def palmar_side(cache: Cache, source: HandSource, hand: HandModel, device: Devic
     return replace(hand, **{name: arrays[name] for name in LINK_ARRAYS}), side
 
 
-def hand_of_shard(
-    cache: Cache, record: HandRecord, config: Mapping[str, Any], device: Device
-) -> tuple[HandSource, HandModel]:
+def hand_of_shard(cache: Cache, record: HandRecord, config: Mapping[str, Any]) -> tuple[HandSource, HandModel]:
     """The hand that the rows of a shard are of, made from the shard alone; cached by its content.
 
     The rules are those in the shard's ``config``. A shard of an older version has none: then those of the very same
@@ -79,7 +77,7 @@ def hand_of_shard(
     source = _with_rules(_written(record), record, config)
     if source.note:
         cache.warn(f"the shard does not hold the rules of its hand '{record.name}'; taken are {source.note}")
-    return _built(cache, source, device, _surface(config))
+    return _built(cache, source, _surface(config))
 
 
 _WRITTEN: dict[str, Path] = {}  # URDFs by the content of their hands
@@ -95,16 +93,16 @@ def _written(record: HandRecord) -> Path:
 
 
 def arrays_of_shard(cache: Cache, record: HandRecord, config: Mapping[str, Any], device: Device) -> HandArrays:
-    """The same on the device; the latest stays there."""
+    """:func:`hand_of_shard`, on a device; the latest stays there."""
 
     def make() -> HandArrays:
-        return upload_hand(hand_of_shard(cache, record, config, device)[1], device.alias, surface.thumb)
+        return upload_hand(hand_of_shard(cache, record, config)[1], device.alias, surface.thumb)
 
     surface = _surface(config)
     return cache.kept.get("hand of shard", (device.alias, record.sha256, str(surface)), make)
 
 
-def object_of_shard(cache: Cache, record: ObjectRecord, device: Device) -> ObjectModel:
+def object_of_shard(cache: Cache, record: ObjectRecord) -> ObjectModel:
     """The object of a shard, preprocessed, in its user frame; cached by its content.
 
     Raises:
@@ -127,12 +125,12 @@ def object_of_shard(cache: Cache, record: ObjectRecord, device: Device) -> Objec
 
         mesh = trimesh.Trimesh(np.asarray(record.vertices, float), np.asarray(record.faces), process=False)
         mesh.metadata["name"] = record.id
-        return preprocess_object(mesh, params=params, device=device.alias)
+        return preprocess_object(mesh, params=params)
 
     return Loader(cache).get("object", ObjectModel, content_key("object", OBJECT_VERSION, **described), make)
 
 
-def named_object(cache: Cache, name: str, scale: float, device: Device) -> ObjectModel:
+def named_object(cache: Cache, name: str, scale: float) -> ObjectModel:
     """An object by name or mesh file (see :func:`find_object`), or the only one of a shard (*.h5); cached.
 
     Raises:
@@ -140,14 +138,14 @@ def named_object(cache: Cache, name: str, scale: float, device: Device) -> Objec
     """
     if not name.endswith(".h5"):
         mesh, key = object_key(name, scale, ObjectParams())
-        return Loader(cache, device.alias).object(mesh, key, scale, ObjectParams())
+        return Loader(cache).object(mesh, key, scale, ObjectParams())
     with ShardReader(user_path(name)) as reader:
         if len(reader.object_ids) != 1:
             raise ShardError(f"{name}: holds the objects {', '.join(reader.object_ids)}; a shard of one is accepted")
         (record,) = reader.objects()
     if scale != 1.0:
         raise ShardError(f"{name}: its object is in metres; --scale {scale:g} is for mesh files")
-    return object_of_shard(cache, record, device)
+    return object_of_shard(cache, record)
 
 
 def mesh_hash(record: ObjectRecord) -> str:
@@ -157,11 +155,9 @@ def mesh_hash(record: ObjectRecord) -> str:
     return h.hexdigest()
 
 
-def _built(
-    cache: Cache, source: HandSource, device: Device, hands: HandParams = LISTED
-) -> tuple[HandSource, HandModel]:
+def _built(cache: Cache, source: HandSource, hands: HandParams = LISTED) -> tuple[HandSource, HandModel]:
     key = hand_model_key(hand_digest(source.urdf, source.spec), hands)
-    return source, Loader(cache, device.alias).hand(source, key, hands)
+    return source, Loader(cache).hand(source, key, hands)
 
 
 def _surface(config: Mapping[str, Any]) -> HandParams:

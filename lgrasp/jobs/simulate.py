@@ -180,12 +180,11 @@ class SimulateJob(SimulateRequest, VerdictJob):
         self, hand: HandRecord, objects: Sequence[ObjectRecord], progress: PartProgress | None = None
     ) -> Scene:
         """What is simulated of a shard: hand and objects cut into convex pieces."""
-        alias = self.device_used.alias
         planes = [b"" if record.tables is None else record.tables.tobytes() for record in objects]
-        key = (alias, hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
+        key = (hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
 
         def make() -> Scene:
-            scene = scene_of(hand, objects, cutter(self.cache, self.events, progress), alias)
+            scene = scene_of(hand, objects, cutter(self.cache, self.events, progress))
             for line in (f"object {solid.name}: {note}" for solid in scene.objects for note in solid.notes):
                 if line not in self._said:
                     self._said.add(line)

@@ -13,6 +13,7 @@ from lgrasp.object.model import ObjectModel
 from lgrasp.object.params import ObjectParams
 from lgrasp.object.sdf import SdfGrid, build_sdf
 from lgrasp.object.surface import fold_cosine, opposite_points, probe_fits, sample_surface, thin
+from lgrasp.runtime.device import start
 
 _RELAXED_ANGLES = (25.0, 35.0)  # [deg] tried when the sharpness mask leaves too few contact points
 
@@ -22,9 +23,8 @@ def preprocess_object(
     *,
     scale: float = 1.0,
     params: ObjectParams | None = None,
-    device: str = "cpu",
 ) -> ObjectModel:
-    """Mesh to ObjectModel; the same input gives the same bytes on one type of device.
+    """Mesh to ObjectModel; the same input gives the same bytes.
 
     Args:
         scale: Factor from the file's unit to metres.
@@ -32,6 +32,7 @@ def preprocess_object(
     Raises:
         ObjectError: The mesh cannot be used; the message names the file, the value and what is accepted.
     """
+    start()
     params = params or ObjectParams()
     mesh = load_mesh(path_or_mesh, scale=scale, params=params)
     notes = list(mesh.notes)
@@ -44,11 +45,10 @@ def preprocess_object(
         max_cells=params.sdf_cells,
         min_cell=params.sdf_min_cell,
         pad=params.sdf_pad,
-        device=device,
     )
     if not (sdf.values < 0.0).any():
         notes.append(f"no SDF cell lies inside: walls are thinner than {sdf.cell * 1000.0:.2g} mm or enclose nothing")
-    contact_points, contact_normals = _contacts(vertices, faces, sdf, params, notes, device)
+    contact_points, contact_normals = _contacts(vertices, faces, sdf, params, notes)
     obstacle_points, obstacle_normals = _obstacles(vertices, faces, params)
     cluster_center, cluster_radius = bounding_spheres(obstacle_points)
     return ObjectModel(
@@ -64,7 +64,7 @@ def preprocess_object(
         notes=notes,
         contact_points=contact_points,
         contact_normals=contact_normals,
-        contact_opposite=opposite_points(contact_points, contact_normals, seed=params.seed, device=device),
+        contact_opposite=opposite_points(contact_points, contact_normals, seed=params.seed),
         obstacle_points=obstacle_points,
         obstacle_normals=obstacle_normals,
         cluster_center=cluster_center,
@@ -76,7 +76,7 @@ def preprocess_object(
 
 
 def _contacts(
-    vertices: np.ndarray, faces: np.ndarray, sdf: SdfGrid, params: ObjectParams, notes: list[str], device: str
+    vertices: np.ndarray, faces: np.ndarray, sdf: SdfGrid, params: ObjectParams, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Contact points and normals, f32, that are neither concave nor beside a fold."""
     normals, area = face_normals(vertices, faces)
@@ -85,7 +85,7 @@ def _contacts(
     points, face = points[keep], face[keep]
     least = max(1, int(params.min_contact_fraction * params.contact_count))
     probe = probe_fits(sdf, points, normals[face], params.probe_radius, params.probe_tolerance)
-    cosine = fold_cosine(vertices, faces, points, face, params.sharp_radius, device=device)
+    cosine = fold_cosine(vertices, faces, points, face, params.sharp_radius)
     chosen = probe & (cosine >= np.cos(np.radians(params.sharp_angle)))
     for angle in (a for a in _RELAXED_ANGLES if a > params.sharp_angle):
         if chosen.sum() < least:

@@ -21,9 +21,7 @@ _SAME_COLOUR = 2  # largest difference of a channel, of 255
 _NAMES_TOLD = 8
 
 
-def region_weights(
-    regions: Sequence[Region], points: np.ndarray, mesh: Path, *, scale: float = 1.0, device: str = "cpu"
-) -> np.ndarray:
+def region_weights(regions: Sequence[Region], points: np.ndarray, mesh: Path, *, scale: float = 1.0) -> np.ndarray:
     """How much points of an object's surface belong to the union of some regions.
 
     Args:
@@ -48,10 +46,10 @@ def region_weights(
         elif region.kind == "sphere":
             own = (np.linalg.norm(points - region.numbers[:3], axis=1) <= region.numbers[3]).astype(float)
         elif region.kind == "mesh":
-            own = _inside(region, points, scale, device)
+            own = _inside(region, points, scale)
         else:
             assert raw is not None
-            face, corner, _ = _locate(raw.vertices * scale, raw.faces, points, device)
+            face, corner, _ = _locate(raw.vertices * scale, raw.faces, points)
             own = (corner * _corner_weights(region, raw, mesh)[face]).sum(axis=1)
         if not (own >= MEMBER).any():
             low, high = points.min(axis=0).round(3), points.max(axis=0).round(3)
@@ -67,22 +65,20 @@ def _triple(x: np.ndarray) -> str:
     return ",".join(f"{value:g}" for value in x)
 
 
-def _inside(region: Region, points: np.ndarray, scale: float, device: str) -> np.ndarray:
+def _inside(region: Region, points: np.ndarray, scale: float) -> np.ndarray:
     """1 for points inside a closed mesh or on it, (n,)."""
     assert region.file is not None
     mesh = load_mesh(region.file, scale=scale)
     if not mesh.closed:
         raise ConfigError(f"region '{region.text}': {region.file} is not watertight; a closed mesh is accepted")
-    face, corner, within = _locate(mesh.vertices, mesh.faces, points, device)
+    face, corner, within = _locate(mesh.vertices, mesh.faces, points)
     foot = np.einsum("nk,nkd->nd", corner, mesh.vertices[mesh.faces[face]])
     return (within | (np.linalg.norm(points - foot, axis=1) <= _SKIN)).astype(float)
 
 
-def _locate(
-    vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, device: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _locate(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nearest face of each point (n,), barycentric coordinates there (n, 3), and whether it is inside (n,)."""
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice("cpu"):
         corners = wp.array(vertices, dtype=wp.vec3)
         mesh = wp.Mesh(corners, wp.array(faces.ravel(), dtype=wp.int32), support_winding_number=True)
         face, inside = (wp.empty(len(points), dtype=wp.int32) for _ in range(2))

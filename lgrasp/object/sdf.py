@@ -38,7 +38,6 @@ def build_sdf(
     max_cells: int,
     min_cell: float = 0.0005,
     pad: float = 0.008,
-    device: str = "cpu",
 ) -> SdfGrid:
     """Signed distance grid of a triangle mesh.
 
@@ -57,7 +56,7 @@ def build_sdf(
     origin, cell, dims = _layout(vertices, max_cells, min_cell, pad)
     corners = _split(vertices[faces].astype(np.float32), _SPLIT_CELLS * cell)
     shape = wp.vec3i(*dims)
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice("cpu"):
         corners_d = wp.array(corners, dtype=wp.vec3)
         key = wp.full(int(np.prod(dims)), np.iinfo(np.uint64).max, dtype=wp.uint64)
         args = [wp.vec3(*origin.tolist()), cell, shape]

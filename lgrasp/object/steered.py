@@ -16,9 +16,7 @@ from lgrasp.object.surface import opposite_points
 _DRAWS = 8192  # entries among which points of unequal weight are drawn
 
 
-def surface_weights(
-    model: ObjectModel, touch: Sequence[Region], avoid: Sequence[Region], mesh: Path, *, device: str = "cpu"
-) -> SurfaceWeights:
+def surface_weights(model: ObjectModel, touch: Sequence[Region], avoid: Sequence[Region], mesh: Path) -> SurfaceWeights:
     """What regions ask of an object.
 
     Args:
@@ -28,10 +26,7 @@ def surface_weights(
         ConfigError, ObjectError: see :func:`~lgrasp.object.regions.region_weights`.
     """
     points = (model.contact_points + model.center).astype(np.float32)
-    both = [
-        region_weights(regions, points, mesh, scale=model.scale, device=device) if regions else None
-        for regions in (touch, avoid)
-    ]
+    both = [region_weights(regions, points, mesh, scale=model.scale) if regions else None for regions in (touch, avoid)]
     return SurfaceWeights(points, both[0], both[1], min((region.share for region in touch), default=1.0))
 
 
@@ -42,7 +37,7 @@ def stored_weights(model: ObjectModel, regions: np.ndarray, share: float) -> Sur
     return SurfaceWeights(points, touch, avoid, share)
 
 
-def steer_object(model: ObjectModel, weights: SurfaceWeights, *, seed: int = 0, device: str = "cpu") -> SteeredObject:
+def steer_object(model: ObjectModel, weights: SurfaceWeights, *, seed: int = 0) -> SteeredObject:
     """An object of whose contact points only those are left that may be touched.
 
     Where all contacts must be on ``touch`` only its points are left, in proportion to their weights. With a share the
@@ -69,6 +64,6 @@ def steer_object(model: ObjectModel, weights: SurfaceWeights, *, seed: int = 0, 
         often = entries_of(density, max(_DRAWS, 2 * n))
     rows = np.repeat(np.arange(n), often)
     points, normals = model.contact_points[rows], model.contact_normals[rows]
-    opposite = opposite_points(points, normals, seed=seed, device=device)
+    opposite = opposite_points(points, normals, seed=seed)
     left = replace(model, contact_points=points, contact_normals=normals, contact_opposite=opposite)
     return SteeredObject(left, weights, on[rows])

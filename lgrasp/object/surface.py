@@ -80,8 +80,6 @@ def fold_cosine(
     points: np.ndarray,
     point_face: np.ndarray,
     radius: float,
-    *,
-    device: str = "cpu",
 ) -> np.ndarray:
     """Smallest cosine between a point's face normal and those reached over the surface within ``radius`` [m].
 
@@ -93,7 +91,7 @@ def fold_cosine(
         Cosines, shape (n,), f32; -1 beside an open edge. Small values mean a fold, an edge or scan noise.
     """
     normals, _ = face_normals(vertices, faces)
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice("cpu"):
         out = wp.empty(len(points), dtype=float)
         inputs = [
             wp.array(vertices[faces], dtype=wp.vec3),
@@ -108,7 +106,7 @@ def fold_cosine(
         return to_numpy(out)
 
 
-def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int, device: str) -> np.ndarray:
+def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int) -> np.ndarray:
     """For each point a random one that a finger and an opposed finger could press together with it.
 
     Both normals are within 30 degrees of the line between the two; cavities in between do not matter.
@@ -120,7 +118,7 @@ def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int, devic
     Returns:
         Indices, shape (n,), int32; -1 where there is none.
     """
-    with wp.ScopedDevice(device):
+    with wp.ScopedDevice("cpu"):
         out = wp.empty(len(points), dtype=wp.int32)
         inputs = [wp.array(points, dtype=wp.vec3), wp.array(normals, dtype=wp.vec3), _OPPOSED, seed]
         wp.launch(kernels.draw_opposite, len(points), inputs, [out])

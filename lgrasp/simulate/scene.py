@@ -35,9 +35,7 @@ class Scene:
     """In the order that ``object_index`` of the rows counts."""
 
 
-def scene_of(
-    hand: HandRecord, objects: Sequence[ObjectRecord], decompose: Decompose = cut_mesh, device: str = "cpu"
-) -> Scene:
+def scene_of(hand: HandRecord, objects: Sequence[ObjectRecord], decompose: Decompose = cut_mesh) -> Scene:
     """The scene of a hand and the objects that rows may have, in whatever order they are given.
 
     Args:
@@ -48,17 +46,17 @@ def scene_of(
         HandError: the hand's URDF or a mesh cannot be used.
         PhysicsError, ObjectError: an object is a point cloud, or flat.
     """
-    solids = [object_of_record(record, decompose, device) for record in sorted(objects, key=lambda record: record.id)]
-    return Scene(hand_of_record(hand, decompose, device), tuple(solids))
+    solids = [object_of_record(record, decompose) for record in sorted(objects, key=lambda record: record.id)]
+    return Scene(hand_of_record(hand, decompose), tuple(solids))
 
 
-def hand_of_record(record: HandRecord, decompose: Decompose, device: str = "cpu") -> HandSolids:
+def hand_of_record(record: HandRecord, decompose: Decompose) -> HandSolids:
     """The hand of a shard, cut into the convex pieces that the generator uses.
 
     Raises:
         ShardError, HandError: as of :func:`checked_urdf`.
     """
     with checked_urdf(record) as urdf:
-        pieces = {link: link_pieces(urdf, link, decompose, device)[0] for link in urdf.links}
+        pieces = {link: link_pieces(urdf, link, decompose)[0] for link in urdf.links}
         cut = frozenset(link for link, elements in urdf.links.items() if len(pieces[link]) > len(elements))
     return HandSolids(record, urdf.joints, pieces, cut)

@@ -55,7 +55,7 @@ class Solid:
         return planes
 
 
-def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, device: str = "cpu") -> Solid:
+def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh) -> Solid:
     """The object of a shard as a rigid body, in the frame of its vertices. Where cutting its mesh fails the hull
     collides, and a note says so.
 
@@ -82,13 +82,13 @@ def object_of_record(record: ObjectRecord, decompose: Decompose = cut_mesh, devi
         holes = ": its holes are filled" if filled else ""
         notes.append(f"the mesh is not closed{holes}; mass and inertia are those of its convex hull")
     pieces = [mesh.vertices[hull.vertices]]
-    excess = _excess(mesh, pieces, device)
+    excess = _excess(mesh, pieces)
     if excess > _ALLOWED_DENT:
         failures = []
         for effort in _EFFORTS:
             try:
                 pieces = _cut(mesh, partial(decompose, what=f"object '{record.name}'"), *effort)
-                excess = _excess(mesh, pieces, device)
+                excess = _excess(mesh, pieces)
                 break
             except DecomposeError as error:
                 failures.append(str(error))
@@ -154,7 +154,7 @@ def _simplified(mesh: trimesh.Trimesh, detail: float) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.asarray(made.vert_properties[:, :3], float), np.asarray(made.tri_verts), process=False)
 
 
-def _excess(mesh: trimesh.Trimesh, pieces: list[np.ndarray], device: str) -> float:
+def _excess(mesh: trimesh.Trimesh, pieces: list[np.ndarray]) -> float:
     """How far the hulls of vertex sets reach out of a mesh [m], by samples of their surfaces."""
     points = []
     for vertices in pieces:
@@ -162,4 +162,4 @@ def _excess(mesh: trimesh.Trimesh, pieces: list[np.ndarray], device: str) -> flo
         shell = trimesh.Trimesh(hull.points, hull.simplices, process=False)
         count = int(np.clip(shell.area / 4.0e-6, 200, 5000))
         points.append(trimesh.sample.sample_surface(shell, count, seed=0)[0])
-    return max(0.0, float(signed_distance(mesh, np.vstack(points), device, winding=True).max()))
+    return max(0.0, float(signed_distance(mesh, np.vstack(points), winding=True).max()))

@@ -73,10 +73,9 @@ def _opened(make: "_Make", host: str, port: int, served: _Served) -> tuple[Site,
 
 def _hand(name: str, cache: Cache) -> "_Make":
     from lgrasp.jobs.shard_inputs import named_hand  # slow to load
-    from lgrasp.runtime.device import resolve_device
     from lgrasp.view.hand import HandView
 
-    source, model = named_hand(cache, name, resolve_device("cpu"))
+    source, model = named_hand(cache, name)
     return partial(HandView, source=source, model=model)
 
 
@@ -84,10 +83,9 @@ def _object(name: str, cache: Cache) -> "_Make":
     import trimesh  # slow to load
 
     from lgrasp.jobs.shard_inputs import named_object
-    from lgrasp.runtime.device import resolve_device
     from lgrasp.view.table import ObjectView
 
-    found = named_object(cache, name, 1.0, resolve_device("cpu"))
+    found = named_object(cache, name, 1.0)
     mesh = trimesh.Trimesh(np.asarray(found.vertices, float), np.asarray(found.faces), process=False)
     return partial(ObjectView, name=found.name, mesh=mesh, notes=tuple(found.notes))
 

@@ -20,7 +20,6 @@ from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.jobs.shard_inputs import named_hand
 from lgrasp.judge.run import judge
-from lgrasp.runtime.device import resolve_device
 
 FIELD = FieldParams(records=8000, index="bvh")
 
@@ -46,7 +45,7 @@ def test_rows_take_the_listed_values_and_are_valid(cache, tmp_path):
         assert len(taken) >= min(4, len(listed))
     # the judge poses every link from the one joint vector: fingers that disagreed would miss their contacts
     assert judge(outcome.paths).valid.all()
-    model = named_hand(cache, name, resolve_device("cpu"))[1]
+    model = named_hand(cache, name)[1]
     wanted = pressed(model, shard.grasps, pipeline.bounds.squeeze_force / pipeline.bounds.squeeze_stiffness)
     assert np.ptp(wanted[:, columns] - shard.grasps.q[:, columns], axis=0).min() > 0.01
     np.testing.assert_allclose(shard.grasps.q_squeeze, wanted, atol=2e-4)

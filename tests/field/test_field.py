@@ -34,7 +34,7 @@ def model() -> HandModel:
 
 @pytest.fixture(scope="module")
 def field(model) -> ContactField:
-    return build_field(upload_hand(model, "cpu"), PARAMS)
+    return build_field(model, PARAMS)
 
 
 @wp.kernel
@@ -251,7 +251,7 @@ def test_pick_is_the_best_of_the_row_or_of_a_few(model, field, asked):
 def test_published_index_equals_brute_force(model):
     """One tree per patch over 1 cm boxes: a query meets a record exactly when its box in some patch holds one."""
     params = PARAMS.model_copy(update={"index": "bvh", "leaf_normals": 64})
-    field = build_field(upload_hand(model, "cpu"), params)
+    field = build_field(model, params)
     p, n = realised(model, field)
     assert len(np.unique(field.leaf_record)) == len(field.leaf_record)
     assert np.diff(field.leaf_first).max() <= 64
@@ -283,9 +283,8 @@ def test_published_index_equals_brute_force(model):
 
 
 def test_memory_bound_is_kept(model):
-    hand = upload_hand(model, "cpu")
-    roomy = build_field(hand, FieldParams(records=8000, cell=0.006, max_mb=512))
-    tight = build_field(hand, FieldParams(records=8000, cell=0.003, max_mb=16))
+    roomy = build_field(model, FieldParams(records=8000, cell=0.006, max_mb=512))
+    tight = build_field(model, FieldParams(records=8000, cell=0.003, max_mb=16))
     assert roomy.cell == 0.006
     assert tight.cell > 0.003
     assert tight.megabytes <= 16
@@ -302,8 +301,8 @@ def test_arrays_round_trip(field):
 
 
 def test_same_seed_same_field(model, field):
-    again = build_field(upload_hand(model, "cpu"), PARAMS)
-    other = build_field(upload_hand(model, "cpu"), PARAMS.model_copy(update={"seed": 1}))
+    again = build_field(model, PARAMS)
+    other = build_field(model, PARAMS.model_copy(update={"seed": 1}))
     for key, value in field.to_arrays().items():
         np.testing.assert_array_equal(value, again.to_arrays()[key], err_msg=key)
     assert len(other.point) == len(field.point)
@@ -316,7 +315,7 @@ def test_field_of_an_opposition_space(name):
     start()
     whole = hand_model("shipped")
     view = spaces_view(*hand_source("shipped"), whole, [name])
-    field = build_field(upload_hand(view, "cpu"), PARAMS)
+    field = build_field(view, PARAMS)
     fingers = set(np.flatnonzero(np.diff(view.contact_first)[:-1]))
     assert set(groups_of(field)) == fingers
     assert np.isnan(field.clear_share).sum() == whole.groups - len(fingers)
@@ -353,4 +352,4 @@ def test_hand_that_is_never_clear(tmp_path):
     model = build_hand(path, minimal_spec("stuck", ["tip"]))
     assert len(model.pairs) == 1
     with pytest.raises(HandError, match=r"no posture of finger .*tip"):
-        build_field(upload_hand(model, "cpu"), FieldParams(records=1000))
+        build_field(model, FieldParams(records=1000))

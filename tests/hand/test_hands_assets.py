@@ -16,7 +16,6 @@ from lgrasp.hand.spec import load_spec
 from lgrasp.hand.tree import build_tree
 from lgrasp.hand.urdf import read_urdf
 from lgrasp.jobs.shard_inputs import named_hand
-from lgrasp.runtime.device import resolve_device
 
 ASSETS = ASSETS / "hands"
 # name -> movable joints, drives, dependency groups
@@ -102,7 +101,7 @@ def test_open_posture_is_inside_the_limits(name):
 
 
 def test_every_finger_and_palm_has_contact_points(name, cache_root):
-    model, spec = named_hand(Cache(cache_root), name, resolve_device("cpu"))[1], find_hand(name).spec
+    model, spec = named_hand(Cache(cache_root), name)[1], find_hand(name).spec
     tree = model.tree
     group = dict(zip(tree.link_names, tree.body_group[tree.link_body], strict=True))
     found = np.bincount(model.contact_link, minlength=len(tree.link_names))

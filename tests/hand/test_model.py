@@ -349,7 +349,7 @@ def test_walls_of_one_body_inside_another_are_no_outside():
     assert one_solid(joined_mesh([boxes[0], *small])).body_count == 2  # sunk by half its side, beside a large one
     whole = one_solid(joined_mesh(boxes))
     assert whole.volume == pytest.approx(0.029 * 0.02**2)
-    grid = link_grid([whole], "cpu")
+    grid = link_grid([whole])
     middle = np.array([[0.0045, 0, 0], [-0.001, 0, 0.003], [0.0105, 0, 0]])  # [m], near walls at x = -1 and 10 mm
     places = [grid.origin[a] + grid.cell * np.arange(grid.values.shape[a]) for a in range(3)]
     np.testing.assert_allclose(interpn(places, grid.values, middle), [-0.01, -0.007, -0.0085], atol=2e-4)

@@ -24,9 +24,7 @@ from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.refine.shards import RefineJob
 from lgrasp.jobs.shard_inputs import hand_of_shard, named_hand, named_object, object_of_shard
 from lgrasp.planning.params import PlanParams
-from lgrasp.runtime.device import resolve_device
 
-CPU = resolve_device("cpu")
 REAL = ASSETS / "hands" / "allegro"
 
 
@@ -64,7 +62,7 @@ def test_a_named_hand_must_be_that_of_the_shard(made: Path, cache_root: Path, tm
 def test_the_hand_is_the_one_that_was_generated_with(job: Callable[..., GenerateJob], cache_root: Path):
     outcome = generate(job(rows=5))
     shard = read_shard(outcome.paths[0])
-    source, model = hand_of_shard(Cache(cache_root, pytest.fail), shard.hand, shard.header.config, CPU)
+    source, model = hand_of_shard(Cache(cache_root, pytest.fail), shard.hand, shard.header.config)
     assert source.spec == hand_source("allegro").spec.model_copy(update={"approximation": ""})
     same(model, outcome.job.inputs.hand.model)
 
@@ -84,11 +82,11 @@ def test_meshes_come_from_the_shard(swift, cache_root: Path, tmp_path: Path):
     assert read_shard(moved.paths[0]).hand.meshes == shard.hand.meshes
     shutil.rmtree(tmp_path / "after")
     fresh = Cache(tmp_path / "cache", pytest.fail)
-    _, model = hand_of_shard(fresh, shard.hand, shard.header.config, CPU)
+    _, model = hand_of_shard(fresh, shard.hand, shard.header.config)
     same(model, outcome.job.inputs.hand.model)
     lost = replace(shard.hand, meshes=dict(list(shard.hand.meshes.items())[1:]))
     with pytest.raises(ShardError, match="is not in the shard"):
-        hand_of_shard(fresh, lost, shard.header.config, CPU)
+        hand_of_shard(fresh, lost, shard.header.config)
     (name, data), *_ = shard.hand.meshes.items()
     outside = replace(
         shard.hand,
@@ -96,13 +94,13 @@ def test_meshes_come_from_the_shard(swift, cache_root: Path, tmp_path: Path):
         meshes={**shard.hand.meshes, "../../m.stl": data},
     )
     with pytest.raises(ShardError, match="outside the hand's folder"):
-        hand_of_shard(fresh, outside, shard.header.config, CPU)
+        hand_of_shard(fresh, outside, shard.header.config)
 
 
 def test_older_shards_take_the_rules_of_a_known_hand_and_say_so(made: Path, cache_root: Path):
     said: list[str] = []
     old = without_rules(read_shard(made), name="mine")
-    source, model = hand_of_shard(Cache(cache_root, said.append), old.hand, old.header.config, CPU)
+    source, model = hand_of_shard(Cache(cache_root, said.append), old.hand, old.header.config)
     assert source.spec.contact == hand_source("allegro").spec.contact
     assert model.name == "mine"
     (line,) = said
@@ -112,7 +110,7 @@ def test_older_shards_take_the_rules_of_a_known_hand_and_say_so(made: Path, cach
 
 def test_older_shards_of_an_installed_hand_need_no_words(job: Callable[..., GenerateJob], cache_root: Path):
     old = without_rules(read_shard(generate(job(rows=5)).paths[0]))
-    source, _ = hand_of_shard(Cache(cache_root, pytest.fail), old.hand, old.header.config, CPU)
+    source, _ = hand_of_shard(Cache(cache_root, pytest.fail), old.hand, old.header.config)
     assert source.spec == hand_source("allegro").spec
 
 
@@ -128,8 +126,8 @@ def test_plans_take_hand_and_object_from_a_shard(made: Path, cache_root: Path, t
 
 def test_an_object_is_cached(made: Path, tmp_path: Path):
     cache, (record,) = Cache(tmp_path / "cache", pytest.fail), read_shard(made).objects
-    whole = object_of_shard(cache, record, CPU)
-    same(object_of_shard(cache, record, CPU), whole)
+    whole = object_of_shard(cache, record)
+    same(object_of_shard(cache, record), whole)
     assert len(cache.entries()) == 1
 
 
@@ -138,12 +136,12 @@ def test_a_shard_of_no_single_object_is_no_object(made: Path, cache_root: Path, 
     two = [shard.objects[0], replace(shard.objects[0], id="zwei")]
     write_shard(tmp_path / "two.h5", replace(shard, objects=two))
     with pytest.raises(ShardError, match="holds the objects mug, zwei"):
-        named_object(Cache(cache_root), str(tmp_path / "two.h5"), 1.0, CPU)
+        named_object(Cache(cache_root), str(tmp_path / "two.h5"), 1.0)
     with pytest.raises(ShardError, match="in metres"):
-        named_object(Cache(cache_root), str(made), 0.001, CPU)
+        named_object(Cache(cache_root), str(made), 0.001)
 
 
 def test_rules_are_plain_json(made: Path, cache_root: Path):
     config = read_shard(made).header.config
     assert json.loads(config["hand_rules"])["name"] == "allegro"
-    assert named_hand(Cache(cache_root, pytest.fail), str(made), CPU)[1].sha256 == read_shard(made).hand.sha256
+    assert named_hand(Cache(cache_root, pytest.fail), str(made))[1].sha256 == read_shard(made).hand.sha256

@@ -16,7 +16,6 @@ from lgrasp.planning.planner import Planner
 from lgrasp.planning.starts import start_poses, tilted
 from lgrasp.refine.params import DISTAL, OTHER
 from lgrasp.refine.surface import farthest_points, hand_surface
-from lgrasp.runtime.device import resolve_device
 
 
 def test_palm_faces_the_point_from_the_stand_off(inputs):
@@ -63,8 +62,7 @@ def test_tilted_directions_lean_by_their_angle_to_all_sides():
 
 
 def test_a_hand_without_a_palm_faces_its_box(cache_root, load):
-    device = resolve_device("cpu")
-    source, dclaw = named_hand(Cache(cache_root, pytest.fail), "dclaw", device)
+    source, dclaw = named_hand(Cache(cache_root, pytest.fail), "dclaw")
     centre, facing = palm_axis(dclaw)
     np.testing.assert_allclose(facing, [1, 0, 0], atol=0.01)  # fingers along +x
     assert np.linalg.norm(centre) < 0.02

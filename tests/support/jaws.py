@@ -104,7 +104,7 @@ def jaws_and_ball(folder: Path, device: str) -> Context:
     model = build_hand(gripper(folder), spec)
     obj = preprocess_object(trimesh.creation.icosphere(4, RADIUS), params=ObjectParams(contact_count=2048))
     hand = upload_hand(model, device)
-    field = upload_field(build_field(hand, FieldParams(records=2000)), model, device)
+    field = upload_field(build_field(model, FieldParams(records=2000)), model, device)
     return Context(hand, upload_object(obj, device), field, device, 0, 0)
 
 

@@ -57,13 +57,13 @@ def opposed(
     return good, width
 
 
-def space_postures(model: HandModel, device: str = "cpu") -> Postures:
+def space_postures(model: HandModel) -> Postures:
     """Random postures of a hand; row r has the shared joints at setting r modulo the number of settings."""
     tree = model.tree
     q = model.random_postures(SAMPLED_POSTURES)
     shared = np.isin(tree.joint_names, tree.shared_names)
     q[:, shared] = np.resize(tree.settings[:, shared], (SAMPLED_POSTURES, int(shared.sum())))
-    return sample_bodies(model, q, device)
+    return sample_bodies(model, q)
 
 
 def space_opening(

@@ -70,7 +70,7 @@ def _longest(masks: tuple[int, ...], joints: int) -> int:
     return max((1 + _longest(masks, joints | mask) for mask in masks if mask & ~joints), default=0)
 
 
-def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = "cpu") -> tuple[ContactLink, ...]:
+def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface]) -> tuple[ContactLink, ...]:
     """The surface of one side of a space, links without any left out."""
     rng = np.random.default_rng(0)
     surfaces = [(link, part) for part in side for link in part.links]
@@ -80,7 +80,7 @@ def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = 
     for link, surface in surfaces:
         T, group = tree.T_body_link[tree.link_names.index(link)], tree.group_of(link)
         around = [m for other in tree.links_on(tree.body_of(link)) for m in meshes[other]]
-        points, normals, area = side_points(meshes[link], around, T, surface, rng, device)
+        points, normals, area = side_points(meshes[link], around, T, surface, rng)
         if len(points):
             rules = body_cones(_outside(surface) if group >= 0 else (), T)
             found.append(ContactLink(link, tree.surface_of(link), points, normals, rules, area))
@@ -88,7 +88,7 @@ def side_surface(urdf: Urdf, tree: Tree, side: Sequence[Surface], device: str = 
 
 
 def space_sides(
-    urdf: Urdf, spec: HandSpec, tree: Tree, name: str, device: str = "cpu"
+    urdf: Urdf, spec: HandSpec, tree: Tree, name: str
 ) -> tuple[tuple[ContactLink, ...], tuple[ContactLink, ...]]:
     """The surface of both sides of a space.
 
@@ -101,7 +101,7 @@ def space_sides(
         raise HandError(f"hand '{spec.name}' has no opposition space '{name}'; its spaces: {known}")
     found = []
     for number, side in enumerate(space.sides, 1):
-        surface = side_surface(urdf, tree, side, device)
+        surface = side_surface(urdf, tree, side)
         if not surface:
             raise HandError(
                 f"hand '{spec.name}': opposition space '{name}': side {number} ({', '.join(side[0].links)}) has no "
@@ -111,9 +111,7 @@ def space_sides(
     return found[0], found[1]
 
 
-def spaces_view(
-    urdf_path: Path, spec: HandSpec, model: HandModel, names: Sequence[str], device: str = "cpu"
-) -> HandModel:
+def spaces_view(urdf_path: Path, spec: HandSpec, model: HandModel, names: Sequence[str]) -> HandModel:
     """The same hand with the two sides of each of some opposition spaces as its only contact surfaces, in this order.
 
     Fingers' sides are contact rules: all that is outside the side's cone is forbidden. A static side is the palm. A box
@@ -121,15 +119,15 @@ def spaces_view(
     distance grids and have no contact point.
 
     Args:
-        urdf_path, spec: what ``model`` was built from. device: answers the geometric queries.
+        urdf_path, spec: what ``model`` was built from.
 
     Raises:
         HandError: see :func:`space_sides`.
     """
     urdf, parts = read_urdf(urdf_path), []
     for name in names:
-        links = [link for side in space_sides(urdf, spec, model.tree, name, device) for link in side]
-        parts.append(surface_arrays(model, urdf, links, device))
+        links = [link for side in space_sides(urdf, spec, model.tree, name) for link in side]
+        parts.append(surface_arrays(model, urdf, links))
     arrays = join_surfaces(parts)
     arrays = with_bare_links(arrays, {name: getattr(model, name) for name in arrays})
     digest = hashlib.sha256(json.dumps([model.sha256, described_spaces(spec, names)]).encode()).hexdigest()
@@ -147,18 +145,18 @@ def _outside(surface: Surface) -> tuple[Cone, ...]:
     return (Cone(axis=(-x, -y, -z), angle=180.0 - surface.angle),) if surface.angle < 180.0 else ()
 
 
-def sided_hand(source: HandSource, model: HandModel, sides: Sequence[LinkSide], device: str) -> HandModel:
+def sided_hand(source: HandSource, model: HandModel, sides: Sequence[LinkSide]) -> HandModel:
     """The same hand, some of whose links touch with a side and with nothing else.
 
     Args:
-        source: what ``model`` was built from. device: answers the geometric queries.
+        source: what ``model`` was built from.
 
     Raises:
         HandError: a link without surface on its side.
     """
     urdf = read_urdf(source.urdf)
     surfaces = [Surface(links=(side.link,), axis=side.axis, angle=side.angle) for side in sides]
-    found = side_surface(urdf, model.tree, surfaces, device)
+    found = side_surface(urdf, model.tree, surfaces)
     for side in sides:
         if side.link not in {entry.link for entry in found}:
             raise HandError(
@@ -167,4 +165,4 @@ def sided_hand(source: HandSource, model: HandModel, sides: Sequence[LinkSide], 
             )
     named = {side.link for side in sides}
     links = [*(entry for entry in listed_links(model) if entry.link not in named), *found]
-    return replace(model, **surface_arrays(model, urdf, links, device))
+    return replace(model, **surface_arrays(model, urdf, links))

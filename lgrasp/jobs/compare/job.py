@@ -180,7 +180,7 @@ class CompareJob(CompareRequest, Job):
         key = content_key("workspace", WORKSPACE_VERSION, hand=job.keys.hand)
 
         def make() -> dict[str, np.ndarray]:
-            model = Loader(self.cache, self.device_used.alias).hand(job.keys.source, job.keys.hand)
+            model = Loader(self.cache).hand(job.keys.source, job.keys.hand)
             return {name: np.asarray(value) for name, value in asdict(measure_workspace(model)).items()}
 
         found, _ = self.cache.get("workspace", key, make)

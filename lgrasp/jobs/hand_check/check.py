@@ -138,16 +138,16 @@ def check_hand(
 
 def check_spaces(inputs: Inputs) -> list[SpaceCheck]:
     """Measure every opposition space of a hand on random postures."""
-    spec, model, device = inputs.keys.source.spec, inputs.hand.model, inputs.hand.device
+    spec, model = inputs.keys.source.spec, inputs.hand.model
     if not spec.opposition_spaces:
         return []
-    urdf, postures = read_urdf(inputs.keys.source.urdf), space_postures(model, device)
+    urdf, postures = read_urdf(inputs.keys.source.urdf), space_postures(model)
     out = []
     for space in hand_spaces(spec, model.tree):
         labels = [finger_label(model.tree, dict(spec.fingers), g) if g >= 0 else "palm" for g in space.groups]
         joints = list(spec.opposition_spaces[space.name].joints)
         try:
-            sides = space_sides(urdf, spec, model.tree, space.name, device)
+            sides = space_sides(urdf, spec, model.tree, space.name)
         except HandError as error:
             out.append(SpaceCheck(space.name, joints, labels, [0.0, 0.0], None, None, str(error).split(": ", 2)[-1]))
             continue

@@ -73,7 +73,7 @@ def _draw_sides(inputs: Inputs, path: Path, paint: _Paint, clouds: list[np.ndarr
 def draw_palmar(inputs: Inputs, path: Path) -> Path:
     """The open hand from four sides, its palmar side in colours: what it pulls to an object, by weight."""
     model = inputs.hand.model
-    side, last = visible_surface(inputs.keys.source, model, inputs.hand.device), last_bodies(model)
+    side, last = visible_surface(inputs.keys.source, model), last_bodies(model)
 
     def paint(samples: SurfaceSamples, mesh: trimesh.Trimesh) -> _Faces:
         own = side.link == model.tree.link_names.index(samples.link)
@@ -95,7 +95,7 @@ def draw_spaces(inputs: Inputs, names: list[str], path: Path) -> Path:
     source, model, hand = inputs.keys.source, inputs.hand.model, _Hand(inputs)
     urdf, view, pictures = read_urdf(source.urdf), _view(hand.points, hand.towards, 35.0, 360), []
     for name in names:
-        sides = space_sides(urdf, source.spec, model.tree, name, inputs.hand.device)
+        sides = space_sides(urdf, source.spec, model.tree, name)
         coloured = [(part, colour) for side, colour in zip(sides, _COLOURS, strict=False) for part in side]
 
         def paint(samples: SurfaceSamples, mesh: trimesh.Trimesh, coloured: list = coloured) -> _Faces:
@@ -112,7 +112,7 @@ class _Hand:
 
     def __init__(self, inputs: Inputs) -> None:
         model = inputs.hand.model
-        postures = sample_bodies(model, model.tree.joint_open[None], inputs.hand.device)
+        postures = sample_bodies(model, model.tree.joint_open[None])
         # links around contact points and body origins: all but an arm
         points = np.vstack([postures.place(0, model.contact_body, model.contact_points), postures.t[0][1:]])
         self.towards = _palmar_direction(model, postures.turn(0, model.contact_body, model.contact_normals))

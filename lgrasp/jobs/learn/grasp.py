@@ -96,7 +96,7 @@ class GraspJob(GraspRequest, NetworkJob):
         """The hand, objects, grasps and views."""
         p, device = self.params, self.device_used
         parts = read_parts(self.shards)
-        hand, _ = load_hand(parts.values(), self.hand, self.cache, device)
+        hand, _ = load_hand(parts.values(), self.hand, self.cache)
         records, grids, views, rows = [], [], [], []
         for _, part in sorted(parts.items()):
             columns, record = part.joined(), part.record
@@ -105,7 +105,7 @@ class GraspJob(GraspRequest, NetworkJob):
             centre = mesh_centre(record.vertices)
             pose = internal_poses(columns["T_hand_object"], centre)
             rows.append((pose, columns["q"][:, : hand.dofs], np.full(len(pose), len(records))))
-            grids.append(coarse_grid(record.vertices, record.faces, closed=record.watertight, device=device.alias))
+            grids.append(coarse_grid(record.vertices, record.faces, closed=record.watertight))
             rng = np.random.default_rng([p.seed, len(records)])
             centred = np.asarray(record.vertices, float) - centre
             views += draw_views(centred, record.faces, p.views, p.cloud, rng, device.alias)
@@ -154,16 +154,16 @@ def evaluate(
     found = resolve_device(device)
     networks, parts = load_networks(path), read_parts(shards)
     first = next(iter(parts.values()))
-    source, hand = hand_of_shard(cache, first.hand, first.config, found)
+    source, hand = hand_of_shard(cache, first.hand, first.config)
     check_network_hand(path, networks.hand, networks.hand_sha256, hand.name, hand.sha256, words=SHARDS)
-    touching, palmar = palmar_side(cache, source, hand, found)
+    touching, palmar = palmar_side(cache, source, hand)
     told = {"network": path.name, "run_key": networks.run_key, "clouds": clouds, "starts": starts}
     hand_on_device, params = upload_hand(touching, found.alias), cloud_params(PlanParams())
     bench = _Bench(networks, source, hand_on_device, palmar, starts, params, seed, told)
     begin = time.perf_counter()
     kinds: dict[str, Any] = {kind: {} for kind in KINDS}
     for number, (_, part) in enumerate(sorted(parts.items())):
-        model = object_of_shard(cache, part.record, found)
+        model = object_of_shard(cache, part.record)
         for which, kind in enumerate(KINDS):
             rng = np.random.default_rng([seed, number, which])
             table = join_rows([bench.plans(model, kind, rng, c) for c in range(clouds)])

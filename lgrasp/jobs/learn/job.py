@@ -116,14 +116,13 @@ def read_examples(
         stream: of random numbers: clouds of another have nothing in common, whatever the seed.
     """
     parts = read_parts(shards)
-    found = resolve_device(device)
-    hand, _ = load_hand(parts.values(), name, cache, found)
+    hand, _ = load_hand(parts.values(), name, cache)
     sets: tuple[list[Examples], list[Examples]] = ([], [])
     for number, (_, part) in enumerate(sorted(parts.items())):
         rows = part.joined()
         if not len(rows["q"]):
             continue
-        model = object_of_shard(cache, part.record, found)
+        model = object_of_shard(cache, part.record)
         for which, (into, clouds) in enumerate(zip(sets, (params.clouds, params.held_out), strict=True)):
             rng = np.random.default_rng([params.seed, number, 2 * stream + which])
             q = rows["q"][:, : hand.dofs]

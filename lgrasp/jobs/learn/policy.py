@@ -85,10 +85,11 @@ class PolicyJob(PolicyRequest, FileJob):
     @cached_property
     def loaded(self) -> tuple[HandArrays, FieldArrays]:
         """Hand and field on the device."""
-        load, alias = Loader(self.cache, self.device_used.alias, self.events.loading), self.device_used.alias
+        load, alias = Loader(self.cache, self.events.loading), self.device_used.alias
         model = load.hand(self.keys.source, self.keys.hand, self.pipeline.hand)
-        hand = upload_hand(model, alias, self.pipeline.hand.thumb)
-        return hand, upload_field(load.field(hand, self.keys.field, self.pipeline.field), model, alias)
+        thumb = self.pipeline.hand.thumb
+        field = load.field(model, self.keys.field, self.pipeline.field, thumb)
+        return upload_hand(model, alias, thumb), upload_field(field, model, alias)
 
     def load(self, events: Events, missing: bool) -> None:
         if missing:
@@ -167,11 +168,11 @@ class PolicyJob(PolicyRequest, FileJob):
         return Context(*parts, bounds=learned.bounds, realised=learned.realised)
 
     def _object(self, number: int) -> ObjectModel:
-        params, alias = self.learned.object, self.device_used.alias
+        params = self.learned.object
         if self.objects:
             path, key = object_key(self.objects[number], self.scale, params)
-            return Loader(self.cache, alias).object(path, key, self.scale, params)
-        return preprocess_object(random_shape(self.params.seed, number), params=params, device=alias)
+            return Loader(self.cache).object(path, key, self.scale, params)
+        return preprocess_object(random_shape(self.params.seed, number), params=params)
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         if not outcome.paths:

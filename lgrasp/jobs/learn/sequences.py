@@ -65,7 +65,7 @@ def read_steps(paths: Paths, cache: Cache, device: Device, cloud: int) -> ReadSt
         if shard.value[:2] != first.value[:2]:
             raise ShardError(f"{shard.path}: another hand or spaces than {first.path}; name shards of one hand")
     with ShardReader(first.path) as reader:
-        _, hand = hand_of_shard(cache, reader.hand(), reader.header.config, device)
+        _, hand = hand_of_shard(cache, reader.hand(), reader.header.config)
     numbers: dict[tuple[str, float], int] = {}
     clouds, grids, names, meshes, parts = [], [], [], [], []
     slots = max(2, *(part.value.columns["object_index"].shape[1] for part in shards))
@@ -77,7 +77,7 @@ def read_steps(paths: Paths, cache: Cache, device: Device, cloud: int) -> ReadSt
                 numbers[key] = len(numbers)
                 clouds.append(torch.as_tensor(surface_cloud(record.vertices, record.faces, cloud)))
                 closed = record.watertight
-                grids.append(coarse_grid(record.vertices, record.faces, closed=closed, device=device.alias))
+                grids.append(coarse_grid(record.vertices, record.faces, closed=closed))
                 names.append(record.name)
                 meshes.append(record.sha256)
             own.append((numbers[key], mesh_centre(record.vertices)))

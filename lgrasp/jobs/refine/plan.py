@@ -85,7 +85,7 @@ class PlanJob(PlanRequest, Job):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         source, hand, model, around = self._models
-        touching, palmar = palmar_side(self.cache, source, hand, self.device_used)
+        touching, palmar = palmar_side(self.cache, source, hand)
         plan, arrays = self._params(), upload_hand(touching, self.device_used.alias)
         begin, networks = time.perf_counter(), self.networks
         if networks is None:
@@ -169,10 +169,10 @@ class PlanJob(PlanRequest, Job):
     @cached_property
     def _models(self) -> tuple[HandSource, HandModel, ObjectModel, ObjectModel | None]:
         """The hand, what is grasped, and what stands around it."""
-        source, hand = named_hand(self.cache, self.hand, self.device_used)
+        source, hand = named_hand(self.cache, self.hand)
         if self.cloud is None:
             assert self.object is not None
-            return source, hand, named_object(self.cache, self.object, self.scale, self.device_used), None
+            return source, hand, named_object(self.cache, self.object, self.scale), None
         cloud = self.cloud
         if isinstance(cloud, Path):
             cloud = cloud_to_grasp(self.cache, cloud, self.mask, self.label, self.scale, self.viewpoint)

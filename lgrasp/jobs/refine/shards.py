@@ -107,7 +107,7 @@ class RefineJob(RefineRequest, ShardJob):
             return Made(0)
         _check_rows(part.source, shard)
         hand = self._hand(part.source, shard)
-        model = object_of_shard(self.cache, shard.objects[0], self.device_used)
+        model = object_of_shard(self.cache, shard.objects[0])
         if "network" in shard.header.config and not len(shard.objects[0].faces):
             self.cache.warn(
                 f"{part.source}: a network planned these rows on surfaces that it guessed; here only the points of the "
@@ -169,7 +169,7 @@ class RefineJob(RefineRequest, ShardJob):
     def _named(self) -> tuple[HandSource, HandModel]:
         """The hand of the option."""
         assert self.hand is not None
-        return named_hand(self.cache, self.hand, self.device_used)
+        return named_hand(self.cache, self.hand)
 
     def _hand(self, path: Path, shard: Shard) -> HandArrays:
         """The hand of a shard, whatever is installed under its name; ``hand`` is only compared with it."""
@@ -218,7 +218,7 @@ def _asked(
     config, record = dict(shard.header.config), shard.objects[0]
     told, left = config.pop("steered", None) or {}, obj
     if record.regions is not None:
-        left = steer_object(obj, stored_weights(obj, record.regions, record.touch_share), device=hand.device)
+        left = steer_object(obj, stored_weights(obj, record.regions, record.touch_share))
     if not told and left is obj:
         return None, obj, config
     asked = Demands.read(told, hand.model, str(path))

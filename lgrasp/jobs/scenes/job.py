@@ -158,7 +158,7 @@ def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Event
             raise ConfigError(f"{config.grasps} has no grasps of object '{name}'; it has {', '.join(there.values())}")
     chosen = {key: part for key, part in found.items() if not wanted or part.record.sha256 in wanted}
     events.loading("hand")
-    hand, record = load_hand(chosen.values(), config.hand, cache, device)
+    hand, record = load_hand(chosen.values(), config.hand, cache)
     items, digest = [], hashlib.sha256(record.sha256.encode())
     for key in sorted(chosen):
         part = chosen[key]
@@ -166,8 +166,8 @@ def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Event
         columns = part.joined()
         if not len(columns["q"]):
             cache.warn(f"object {part.record.id} has no grasps; in scenes it is only in the way")
-        model = object_of_shard(cache, part.record, device)
-        solid = object_of_record(part.record, cutter(cache, events), device.alias)
+        model = object_of_shard(cache, part.record)
+        solid = object_of_record(part.record, cutter(cache, events))
         items.append(Item(part.record, solid, upload_object(model, device.alias), **columns))
         digest.update(mesh_hash(part.record).encode())
         for values in columns.values():

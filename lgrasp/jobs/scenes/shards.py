@@ -18,7 +18,6 @@ from lgrasp.hand.digest import hand_digest
 from lgrasp.hand.model import HandModel
 from lgrasp.jobs.hands import hand_source
 from lgrasp.jobs.shard_inputs import hand_of_shard, mesh_hash
-from lgrasp.runtime.device import Device
 
 _COLUMNS = (*POSTURES, "candidate")
 
@@ -103,9 +102,7 @@ def check_finite(path: Path, columns: Mapping[str, np.ndarray]) -> None:
             )
 
 
-def load_hand(
-    parts: Collection[Grasped], name: str | None, cache: Cache, device: Device
-) -> tuple[HandModel, HandRecord]:
+def load_hand(parts: Collection[Grasped], name: str | None, cache: Cache) -> tuple[HandModel, HandRecord]:
     """The hand of some shards, made from them; ``name``, where one is given, must be of the same hand.
 
     Raises:
@@ -114,7 +111,7 @@ def load_hand(
     """
     part = next(iter(parts))
     check_hand(part.hand, name, f"the grasps of '{part.record.id}'")
-    return hand_of_shard(cache, part.hand, part.config, device)[1], part.hand
+    return hand_of_shard(cache, part.hand, part.config)[1], part.hand
 
 
 def check_hand(hand: HandRecord | HandModel, name: str | None, what: str) -> None:

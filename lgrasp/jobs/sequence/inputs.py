@@ -137,9 +137,9 @@ def load_sequence_inputs(
     Raises:
         ConfigError: more objects than the hand's opposition spaces can take one after another.
     """
-    load, alias = Loader(cache, device.alias, report), device.alias
+    load, alias = Loader(cache, report), device.alias
     key = alias, keys.hand, keys.view, keys.field
-    model, spaces, view = cache.kept.get("spaces", key, lambda: _load_spaces(load, keys, fields))
+    model, spaces, view = cache.kept.get("spaces", key, lambda: _load_spaces(load, keys, fields, alias))
     most = longest(spaces, (), np.zeros(model.dofs, bool))
     if len(keys.meshes) > most:
         raise ConfigError(
@@ -161,16 +161,16 @@ def load_sequence_inputs(
 
 
 def _load_spaces(
-    load: Loader, keys: SequenceKeys, fields: FieldParams
+    load: Loader, keys: SequenceKeys, fields: FieldParams, device: str
 ) -> tuple[HandModel, tuple[Space, ...], SpacesView]:
     """The hand, its opposition spaces and its view by them, on the device."""
-    source, alias = keys.source, load.device
+    source = keys.source
     model = load.hand(source, keys.hand)
     spaces = hand_spaces(source.spec, model.tree)
-    make = partial(spaces_view, source.urdf, source.spec, model, [space.name for space in spaces], alias)
+    make = partial(spaces_view, source.urdf, source.spec, model, [space.name for space in spaces])
     view = load.get("hand", HandModel, keys.view, make)
-    hand = upload_hand(view, alias)
-    return model, spaces, SpacesView(hand, upload_field(load.field(hand, keys.field, fields), view, alias))
+    field = load.field(view, keys.field, fields)
+    return model, spaces, SpacesView(upload_hand(view, device), upload_field(field, view, device))
 
 
 def _object_scales(meshes: Sequence[Path], size: Size, seed: int) -> tuple[float, ...]:

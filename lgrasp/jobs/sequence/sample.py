@@ -116,5 +116,5 @@ def _seen(model: ObjectModel, count: int, device: str) -> tuple[np.ndarray, SdfG
     if not len(model.faces):
         drawn = np.random.default_rng(0).choice(len(model.obstacle_points), count)
         return model.obstacle_points[drawn], coarse_grid_of_model(model)
-    grid = coarse_grid(model.vertices, model.faces, closed=model.watertight, device=device)
+    grid = coarse_grid(model.vertices, model.faces, closed=model.watertight)
     return surface_cloud(model.vertices, model.faces, count), grid

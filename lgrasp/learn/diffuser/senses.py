@@ -34,10 +34,10 @@ class HeldObjects(NamedTuple):
     """Position [m], (N, S, 3)."""
 
 
-def coarse_grid(vertices: np.ndarray, faces: np.ndarray, *, closed: bool, device: str = "cpu") -> SdfGrid:
+def coarse_grid(vertices: np.ndarray, faces: np.ndarray, *, closed: bool) -> SdfGrid:
     """Signed distances of a mesh about :func:`~lgrasp.learn.diffuser.features.mesh_centre`."""
     centred = np.asarray(vertices, float) - mesh_centre(vertices)
-    grid = build_sdf(centred, np.asarray(faces, np.int32), closed=closed, max_cells=_NODES, pad=_PAD, device=device)
+    grid = build_sdf(centred, np.asarray(faces, np.int32), closed=closed, max_cells=_NODES, pad=_PAD)
     return replace(grid, values=grid.values.astype(np.float32))
 
 

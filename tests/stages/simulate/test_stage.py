@@ -30,7 +30,7 @@ pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra sim)")
 def context(load, cache_root) -> Context:
     inputs = load("sphere")
     objects, meshes = [object_record(inputs.object.model)], mesh_blobs(inputs.keys.source.urdf)
-    scene = make_scene(Cache(cache_root, pytest.fail), inputs.hand.model, objects, meshes, "cpu")
+    scene = make_scene(Cache(cache_root, pytest.fail), inputs.hand.model, objects, meshes)
     return Context(inputs.hand, inputs.object, inputs.field, "cpu", 0, 0, scene=scene)
 
 

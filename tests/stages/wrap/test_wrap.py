@@ -58,7 +58,7 @@ def gripper(tmp_path_factory, device):
     mesh.apply_transform(np.block([[along_x, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]))
     obj = preprocess_object(mesh, params=ObjectParams(contact_count=2048))
     hand = upload_hand(model, device)
-    field = upload_field(build_field(hand, FieldParams(records=2000)), model, device)
+    field = upload_field(build_field(model, FieldParams(records=2000)), model, device)
     return Context(hand, upload_object(obj, device), field, device, 0, 0)
 
 
