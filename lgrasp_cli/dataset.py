@@ -12,7 +12,7 @@ from lgrasp.choices import FormatName, MetricName
 from lgrasp.words import number, plural
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Quiet, Shards, Where, old_name, set_option, split, warn
-from lgrasp_cli.tables import Answer, Block, TextTable, checked, following, place, reporting, took
+from lgrasp_cli.tables import Answer, Block, TextTable, checked, ending, reporting, took
 from lgrasp_cli.training import normalisation, split_rows
 from lgrasp_cli.working import How, working
 
@@ -109,9 +109,7 @@ def _show_metrics(data: dict[str, Any]) -> list[Block]:
     pairs = [
         ("rows", f"{data['rows']:,}; {data['present']:,} were there already"),
         ("metrics", ", ".join(data["metrics"])),
-        *took(data, "rows"),
-        place(data),
-        following("dataset report", data["out"]),
+        *ending(data, "rows", "dataset report"),
     ]
     return [_set_table(data["sets"]), "", pairs] if data["sets"] else [pairs]
 

@@ -22,7 +22,7 @@ from lgrasp_cli.options import (
     given,
     refuse_twice,
 )
-from lgrasp_cli.tables import Block, closed, counted, following, held, place, took
+from lgrasp_cli.tables import Block, closed, counted, ending, held
 from lgrasp_cli.working import How, working
 
 _LIKELY = 0.05  # probability of a resting pose that is named when it has no grasps
@@ -187,6 +187,7 @@ def generate(
 
 def _show(data: dict[str, Any]) -> list[Block]:
     near, looser = data["near_duplicates"], data["grasps"] - data["strict"]
+    after = "render" if data["protocol"] else "simulate"
     pairs = [
         ("grasps", counted(data, "grasps")),
         *held(data),
@@ -195,9 +196,7 @@ def _show(data: dict[str, Any]) -> list[Block]:
         closed(data),
         *_resting(data.get("resting", [])),
         *([("strict bounds", f"{looser:,} grasps meet only those of the pipeline")] if looser else ()),
-        *took(data, "grasps"),
-        place(data),
-        *([following("render" if data["protocol"] else "simulate", data["out"])] if data["grasps"] else ()),
+        *ending(data, "grasps", after if data["grasps"] else ""),
     ]
     return [pairs]
 

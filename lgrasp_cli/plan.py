@@ -8,7 +8,7 @@ from typer import Argument, Option
 from lgrasp.choices import FormatName
 from lgrasp_cli.names import HAND_OR_SHARD, NETWORK, OBJECT_OR_SHARD, one_of
 from lgrasp_cli.options import Scale, Settings, Viewpoint, position
-from lgrasp_cli.tables import Block, TextTable, closed, following, place, took
+from lgrasp_cli.tables import Block, TextTable, closed, ending
 from lgrasp_cli.working import How, working
 
 
@@ -71,9 +71,7 @@ def _show(data: dict[str, Any]) -> list[Block]:
         ("plans", f"{data['grasps']:,} of {data['starts']:,} starts ({lost_starts(data['counts']) or 'none lost'})"),
         closed(data),
         ("quality", f"median epsilon {data['epsilon']:.3f}, unresisted load {data['unresisted_load']:.2f}"),
-        *took(data, "plans"),
-        place(data),
-        following("render" if data["points"] else "simulate", data["out"]),
+        *ending(data, "plans", "render" if data["points"] else "simulate"),
     ]
     return [pairs]
 
@@ -122,7 +120,7 @@ def _show_refined(data: dict[str, Any]) -> list[Block]:
         (one["hand"], one["object"], *(f"{one[n.replace(' ', '_')]:,}" for n in names[2:])) for one in data["results"]
     ]
     points = all(one["points"] for one in data["results"])  # which no simulator takes
-    pairs = [closed(data), *took(data, "rows"), place(data), following("render" if points else "simulate", data["out"])]
+    pairs = [closed(data), *ending(data, "rows", "render" if points else "simulate")]
     return [TextTable(names, rows, right=names[2:]), pairs]
 
 

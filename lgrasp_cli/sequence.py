@@ -8,7 +8,7 @@ from typer import Argument, Option
 from lgrasp.choices import Method, Policy
 from lgrasp_cli.names import HAND, NETWORK, OBJECT, PIPELINE, one_of
 from lgrasp_cli.options import Hand, Seed, Settings, Simulate, Viewpoint, choose_pipeline, position
-from lgrasp_cli.tables import Block, TextTable, counted, following, held, place, share, took
+from lgrasp_cli.tables import Block, TextTable, counted, ending, held, share
 from lgrasp_cli.working import How, working
 
 Objects = Annotated[list[str], Argument(help="Mesh files or names of objects, in the order of grasping.", **OBJECT)]
@@ -105,9 +105,7 @@ def _show(data: dict[str, Any]) -> list[Block]:
     pairs = [
         ("sequences", counted(data, "sequences")),
         *held(data),
-        *took(data, "sequences"),
-        place(data),
-        following("render" if data["protocol"] else "simulate --protocol seq6", data["out"]),
+        *ending(data, "sequences", "render" if data["protocol"] else "simulate --protocol seq6"),
     ]
     return [pairs]
 

@@ -9,7 +9,7 @@ from lgrasp.choices import EngineName, ProtocolName
 from lgrasp.words import number
 from lgrasp_cli.names import one_of
 from lgrasp_cli.options import Copies, Shards
-from lgrasp_cli.tables import Block, TextTable, following, place, share, took
+from lgrasp_cli.tables import Block, TextTable, ending, share
 from lgrasp_cli.working import How, working
 
 
@@ -64,9 +64,7 @@ def _show(data: dict[str, Any]) -> list[Block]:
     pairs = [
         ("protocol", f"{name}, {_friction(data['protocol'])}"),
         *((cause.split("_", 1)[-1].replace("_", " "), f"{n:,} {told[cause]}") for cause, n in lost.items() if n),
-        *took(data, "grasps"),
-        place(data),
-        following("dataset report", data["out"]),
+        *ending(data, "grasps", "dataset report"),
     ]
     return [TextTable(names, rows, right=names[2:]), pairs]
 
@@ -156,8 +154,6 @@ def _show_reach(data: dict[str, Any]) -> list[Block]:
     columns = ("hand", "object", "grasps", *(name.replace("_", " ") for name in CODES))
     pairs = [
         ("arm", f"{data['arm']}, {len(data['joints'])} joints, hand on {data['tip']}"),
-        *took(data, "grasps"),
-        place(data),
-        following("dataset report", data["out"]),
+        *ending(data, "grasps", "dataset report"),
     ]
     return [TextTable(columns, rows, right=columns[2:]), pairs]

@@ -134,9 +134,10 @@ def following(command: str, path: Any, more: str = "") -> tuple[str, str]:
     return "next", f"lgrasp {command} {shlex.quote(str(path))}{more}"
 
 
-def place(data: dict[str, Any]) -> tuple[str, str]:
-    """Where the shards of a job are."""
-    return "where", f"{data['out']} ({plural(len(data['shards']), 'shard')})"
+def ending(data: dict[str, Any], unit: str, command: str = "") -> list[tuple[str, str]]:
+    """The time of a job, where its shards are, and the command, if there is one, that one would run next on them."""
+    where = ("where", f"{data['out']} ({plural(len(data['shards']), 'shard')})")
+    return [*took(data, unit), where, *([following(command, data["out"])] if command else ())]
 
 
 def checked(problems: dict[str, list[str]], unit: str) -> Answer:
