@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from trimesh import Trimesh
 from trimesh.exchange.obj import export_obj
 
 import lgrasp
-from lgrasp.dataset.exports.hand import HandFrames, hand_files
+from lgrasp.dataset.exports.hand import HandFrames
 from lgrasp.dataset.exports.selection import ExportObject, Selection
 from lgrasp.errors import OutputError
 from lgrasp.files import remove_leftovers, write_file
@@ -82,14 +82,13 @@ def _files(out: Path) -> list[Path]:
     return [path for path in out.rglob("*") if path.is_file() or path.is_symlink()]
 
 
-def write_assets(out: Path, selection: Selection) -> None:
-    """Write the hand (URDF and meshes) and the meshes of the objects, in metres, as OBJ.
+def write_assets(out: Path, selection: Selection, hand: Mapping[str, bytes]) -> None:
+    """Write the files of the hand, by their path, and the meshes of the objects, in metres, as OBJ.
 
     Raises:
-        ShardError: A shard lacks a mesh of its hand.
         OutputError: The folder cannot be written.
     """
-    for name, data in hand_files(selection.hand, selection.shards[0]).items():
+    for name, data in hand.items():
         write_file(out / HAND / name, data)
     for item in selection.objects:
         if not len(item.mesh().faces):
@@ -120,13 +119,6 @@ def begin(out: Path, run_key: str, before: Sequence[Path] = ()) -> None:
     """
     files = {"files": [path.relative_to(out).as_posix() for path in before]} if before else {}
     write_file(out / UNFINISHED, json.dumps({"run_key": run_key, **files}))
-
-
-def abandon(out: Path) -> None:
-    """Remove the folder of an export that failed before its first file."""
-    if [path.name for path in out.iterdir() if not is_litter(path.name)] == [UNFINISHED]:
-        remove(out, _files(out))
-        out.rmdir()
 
 
 def _is_own(out: Path, run_key: str) -> bool:

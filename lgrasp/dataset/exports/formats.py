@@ -12,7 +12,6 @@ from lgrasp.dataset.exports.card import publish
 from lgrasp.dataset.exports.dexgraspbench import DEXGRASPBENCH_NOTES, read_dexgraspbench, write_dexgraspbench
 from lgrasp.dataset.exports.dexgraspnet import DEXGRASPNET_NOTES, read_dexgraspnet, write_dexgraspnet
 from lgrasp.dataset.exports.folder import (
-    abandon,
     begin,
     check_empty,
     readme,
@@ -22,7 +21,7 @@ from lgrasp.dataset.exports.folder import (
     write_index,
 )
 from lgrasp.dataset.exports.graspgen import GRASPGEN_NOTES, read_graspgen, write_graspgen
-from lgrasp.dataset.exports.hand import HandFrames
+from lgrasp.dataset.exports.hand import HandFrames, hand_files
 from lgrasp.dataset.exports.isaac_grasp import ISAAC_GRASP_NOTES, read_isaac_grasp, write_isaac_grasp
 from lgrasp.dataset.exports.mjcf import MJCF_NOTES, Cut, MjcfWriter, read_mjcf
 from lgrasp.dataset.exports.options import check_options
@@ -33,7 +32,7 @@ from lgrasp.dataset.exports.usd import USD_NOTES, UsdWriter, read_usd
 from lgrasp.dataset.exports.webdataset import WEBDATASET_NOTES, read_webdataset, webdataset_writer
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.split import Split
-from lgrasp.errors import ConfigError, LgraspError
+from lgrasp.errors import ConfigError
 from lgrasp.files import write_file
 from lgrasp.notices import notice
 from lgrasp.words import plural
@@ -134,6 +133,7 @@ def export_shards(
         notice(f"{left} left out, as metric valid is 0; --where '{ALL}' takes them, too")
     selection = replace(selection, hand=plain_hand(selection.hand))
     frames = HandFrames(selection.hand.urdf, selection.hand.base_link, selection.hand.joint_names, selection.shards[0])
+    hand = hand_files(selection.hand, selection.shards[0])
     write = form.writer(selection, frames, cut)
     chosen = list(map(str, conditions))
     done = 0
@@ -148,11 +148,7 @@ def export_shards(
         begin(out, run_key, before)
         remove(out, before)
     begin(out, run_key)
-    try:
-        write_assets(out, selection)
-    except LgraspError:
-        abandon(out)
-        raise
+    write_assets(out, selection, hand)
     write_file(out / "README.txt", readme(selection, frames, form.notes, chosen))
     write(out, count)
     if licence:

@@ -267,7 +267,10 @@ def test_bad_input_leaves_nothing(tmp_path, shards):
 
 
 def test_a_hand_that_cannot_be_used_is_named(tmp_path, shards):
+    """Nothing is begun with it, and what it was to replace stays."""
     hand = shards.hand("allegro")
+    shards.make(tmp_path / "b.h5", hand, n=2)
+    export_shards(tmp_path / "b.h5", tmp_path / "before", "dexgraspnet")
     for urdf, words in [
         ("<robot", "not XML"),
         (hand.urdf.replace('name="joint_3.0"', 'name="other"'), "no movable joint 'joint_3.0'"),
@@ -286,6 +289,9 @@ def test_a_hand_that_cannot_be_used_is_named(tmp_path, shards):
             with pytest.raises(LgraspError, match=words):
                 export_shards(tmp_path / "a.h5", tmp_path / "out", form)
             assert not (tmp_path / "out").exists()
+            with pytest.raises(LgraspError, match=words):
+                export_shards(tmp_path / "a.h5", tmp_path / "before", form, replaces=True)
+            assert len(read_grasps(tmp_path / "before", "dexgraspnet").grasps) == 2
 
 
 def test_what_any_simulator_saw_fail(tmp_path, shards):
