@@ -1,7 +1,9 @@
 """Joints that follow others: the couplings of a URDF and of hand.yaml."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +14,19 @@ from lgrasp.math.constants import LIMIT_EXCESS
 from lgrasp.notices import notice
 
 _LITTLE = 0.1  # of a joint's range that followers leave, which is told
+
+J = TypeVar("J", int, str)
+
+
+def resolve_mimic(joint: J, mimics: Mapping[J, tuple[J, float, float]]) -> tuple[J, float, float]:
+    """The joint at the end of a chain of mimics, itself if it mimics none: position = factor x that one's + offset."""
+    factor, offset = 1.0, 0.0
+    for _ in mimics:  # no chain is longer
+        if joint not in mimics:
+            break
+        joint, multiplier, shift = mimics[joint]
+        factor, offset = factor * multiplier, offset + factor * shift
+    return joint, factor, offset
 
 
 def with_mimic(urdf: Urdf, spec: HandSpec) -> Urdf:
@@ -49,19 +64,14 @@ def find_drives(urdf: Urdf) -> dict[str, tuple[str, float, float]]:
     Raises:
         HandError: a joint that follows 0 times is held outside its limits.
     """
-    by_name = {j.name: j for j in urdf.joints}
-    drives = {}
-    for joint in (j for j in urdf.joints if j.movable):
-        at, mult, offset = joint, 1.0, 0.0
-        while at.mimic is not None:
-            source, m, b = at.mimic
-            # x_at = m * x_source + b
-            at, mult, offset = by_name[source], mult * m, offset + mult * b
-        drives[joint.name] = (at.name, mult, offset)
+    movable, drives = [j for j in urdf.joints if j.movable], {}
+    mimics = {j.name: j.mimic for j in movable if j.mimic is not None}
+    for joint in movable:
+        source, mult, offset = drives[joint.name] = resolve_mimic(joint.name, mimics)
         held = mult == 0.0 and not joint.continuous
         if held and not joint.lower - LIMIT_EXCESS <= offset <= joint.upper + LIMIT_EXCESS:
             raise HandError(
-                f"URDF {urdf.path}: joint '{joint.name}' follows '{at.name}' times 0, so it is held at {offset:g}, "
+                f"URDF {urdf.path}: joint '{joint.name}' follows '{source}' times 0, so it is held at {offset:g}, "
                 f"outside its limits [{joint.lower:g}, {joint.upper:g}]"
             )
     return drives

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from lgrasp.hand.couplings import resolve_mimic
 from lgrasp.hand.urdf import Joint, Urdf
 
 
@@ -28,17 +29,10 @@ def mimics_of(joints: Iterable[Joint]) -> Mimics:
 def joint_values(mimics: Mimics, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Positions [rad or m] of all joints by name, from those of some, shape [n]: others follow the joint that they
     mimic, or are 0."""
-    rows, found = len(next(iter(values.values()), np.zeros(1))), dict(values)
-
-    def value(name: str) -> np.ndarray:
-        if name not in found:
-            mimic = mimics[name]
-            found[name] = np.zeros(rows) if mimic is None else mimic[1] * value(mimic[0]) + mimic[2]
-        return found[name]
-
-    for name in mimics:
-        value(name)
-    return found
+    zero = np.zeros(len(next(iter(values.values()), np.zeros(1))))
+    follow = {name: mimic for name, mimic in mimics.items() if mimic and name not in values}
+    leaders = {name: resolve_mimic(name, follow) for name in mimics if name not in values}
+    return dict(values) | {name: m * values.get(source, zero) + b for name, (source, m, b) in leaders.items()}
 
 
 def link_poses(urdf: Urdf, base_link: str, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

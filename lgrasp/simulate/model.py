@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lgrasp.errors import PhysicsError, short_reason
+from lgrasp.hand.couplings import resolve_mimic
 from lgrasp.hand.links import joint_values, joints_above, mimics_of
 from lgrasp.runtime.optional import import_mujoco
 from lgrasp.simulate.assemble import OBJECT, TABLE, assemble
@@ -158,15 +159,8 @@ def leaders(model: Any, joints: Iterable[int]) -> list[tuple[int, float, float]]
     """
     equal = model.eq_type == import_mujoco().mjtEq.mjEQ_JOINT
     follows = zip(model.eq_obj1id[equal], model.eq_obj2id[equal], model.eq_data[equal, :2].tolist(), strict=True)
-    source = {int(a): (int(b), shift, multiplier) for a, b, (shift, multiplier) in follows}
-    found = []
-    for joint in joints:
-        at, factor, offset = int(joint), 1.0, 0.0
-        while at in source:  # a mimic joint: offset + multiplier x its source
-            at, shift, multiplier = source[at]
-            factor, offset = factor * multiplier, offset + factor * shift
-        found.append((at, factor, offset))
-    return found
+    mimics = {int(a): (int(b), multiplier, shift) for a, b, (shift, multiplier) in follows}
+    return [resolve_mimic(int(joint), mimics) for joint in joints]
 
 
 def effort_limit(model: Any, joint: int) -> float:

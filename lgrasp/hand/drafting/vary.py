@@ -10,6 +10,7 @@ from lxml import etree
 
 from lgrasp.errors import HandError
 from lgrasp.files import new_folder, write_file
+from lgrasp.hand.couplings import find_drives, with_mimic
 from lgrasp.hand.drafting.elements import number_text
 from lgrasp.hand.find import HandSource
 from lgrasp.hand.spec import Box, HandSpec, OppositionSpace, Surface
@@ -53,24 +54,20 @@ def write_variant(source: HandSource, kind: str, factor: float, name: str, folde
 
 
 def _joint_limit(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpec, factor: float) -> HandSpec:
-    couplings = {joint.name: joint.mimic for joint in urdf.joints if joint.mimic is not None}
-    couplings |= {name: (c.joint, c.multiplier, c.offset) for name, c in spec.mimic.items()}
+    drives = find_drives(with_mimic(urdf, spec))
     # as narrowed by the joints that follow, so that the range of a joint is really another
     driven = dict(zip(tree.listed_names, tree.listed_limits.astype(float).tolist(), strict=True))
 
     def limits(name: str) -> tuple[float, float]:
-        if name in couplings:
-            leader, multiplier, offset = couplings[name]
-            low, high = sorted(multiplier * end + offset for end in limits(leader))
-            return low, high
-        low, high = driven[name]
+        leader, multiplier, offset = drives[name]
+        low, high = driven[leader]
         middle, half = (low + high) / 2, factor * (high - low) / 2
-        return middle - half, middle + half
+        low, high = sorted(multiplier * end + offset for end in (middle - half, middle + half))
+        return low, high
 
-    known = {joint.name for joint in urdf.joints if joint.movable}
     for joint in robot.findall("joint"):
         limit = joint.find("limit")
-        if joint.get("name") not in known or limit is None or joint.get("type") == "continuous":
+        if joint.get("name") not in drives or limit is None or joint.get("type") == "continuous":
             continue
         low, high = limits(joint.get("name", ""))
         if low < high:  # what is coupled by 0 does not move
@@ -78,7 +75,7 @@ def _joint_limit(robot: etree._Element, urdf: Urdf, tree: Tree, spec: HandSpec, 
             limit.set("upper", repr(high))
 
     def inside(name: str, value: float) -> float:
-        return float(np.clip(value, *limits(name))) if name in driven or name in couplings else value
+        return float(np.clip(value, *limits(name))) if name in drives else value
 
     held = {name: inside(name, value) for name, value in spec.locked.items()}
     opened = {name: inside(name, value) for name, value in spec.open_posture.items()}
