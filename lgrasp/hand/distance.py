@@ -4,10 +4,14 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from lgrasp.runtime.cores import cores
 from lgrasp.runtime.device import KERNEL_OPTIONS, start
 from lgrasp.runtime.fetch import to_numpy
+from lgrasp.runtime.ordered import in_order
 
 wp.set_module_options(KERNEL_OPTIONS)
+
+_LEAST_POINTS = 2000  # that are worth a thread
 
 
 @wp.kernel
@@ -49,5 +53,13 @@ def signed_distance(mesh: trimesh.Trimesh, points: np.ndarray, *, winding: bool 
     )
     out = wp.empty(len(points), dtype=wp.float32, device="cpu")
     queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device="cpu")
-    wp.launch(mesh_distance, dim=len(points), inputs=[handle.id, queries, winding], outputs=[out], device="cpu")
+
+    def measure(rows: slice) -> None:
+        inputs = [handle.id, queries[rows], winding]
+        wp.launch(mesh_distance, len(queries[rows]), inputs, [out[rows]], device="cpu")
+
+    share = max(_LEAST_POINTS, -(-len(points) // cores()))
+    parts = [slice(at, min(at + share, len(points))) for at in range(0, len(points), share)]
+    for _ in in_order(measure, parts, len(parts)):
+        pass
     return to_numpy(out)

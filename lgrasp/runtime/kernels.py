@@ -55,7 +55,7 @@ def load_kernels(device: str, modules: list[str], progress: Callable[[str, float
     """
     folder = usable_folder(Path(wp.config.kernel_cache_dir))
     wp.config.kernel_cache_dir = str(folder)
-    with ThreadPoolExecutor(min(cores(), 4)) as pool:
+    with ThreadPoolExecutor(min(cores(), 8)) as pool:
         waiting = {pool.submit(wp.load_module, name, device): name for name in modules}
         for done, future in enumerate(as_completed(waiting), 1):
             future.result()
