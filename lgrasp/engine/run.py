@@ -27,7 +27,7 @@ from lgrasp.notices import notice
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import Device, resolve_device
-from lgrasp.runtime.kernels import first_time, kernel_modules, load_kernels
+from lgrasp.runtime.kernels import first_time, kernel_modules, load_kernels, load_preparing
 from lgrasp.runtime.ordered import in_order
 from lgrasp.words import plural
 
@@ -267,8 +267,11 @@ def run(
 def prepare(job: Job, todo: "Todo") -> float:
     """Load the inputs and kernels of a job that :func:`look` saw; seconds that the kernels took."""
     missing = [part for part in todo.parts if part.number not in todo.present]
+    begin = time.perf_counter()
     if missing and job.kernels and (words := first_time(todo.device.alias)):
         job.events.said(words)
+        load_preparing(job.events.loading)
+    kernels = time.perf_counter() - begin
     job.load(job.events, bool(missing))
     begin = time.perf_counter()
     if missing and job.kernels:
@@ -276,7 +279,7 @@ def prepare(job: Job, todo: "Todo") -> float:
             warmed = pool.submit(job.warm)
             load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading)
             warmed.result()
-    return time.perf_counter() - begin
+    return kernels + time.perf_counter() - begin
 
 
 def _described(job: Job, array: Array) -> ListedRun:

@@ -46,6 +46,18 @@ def first_time(device: str) -> str:
     return "compiling kernels once for this machine (30 to 60 s on two cores)"
 
 
+PREPARING = ("field.kernels", "hand.arrays", "hand.distance", "hand.pairs", "object.kernels")
+"""Modules whose kernels make hands, objects and fields."""
+
+
+def load_preparing(progress: Callable[[str, float], None] | None = None) -> None:
+    """Compile and load :data:`PREPARING`, side by side; the CPU runs them."""
+    names = [f"lgrasp.{name}" for name in PREPARING]
+    for name in names:
+        importlib.import_module(name)
+    load_kernels("cpu", names, progress)
+
+
 def load_kernels(device: str, modules: list[str], progress: Callable[[str, float], None] | None = None) -> None:
     """Compile and load modules for one device, several at a time; elsewhere than so far if the disk has become full.
 

@@ -20,6 +20,7 @@ from lgrasp.jobs.refine.plan import PlanJob
 from lgrasp.jobs.scenes.job import SceneJob
 from lgrasp.planning.params import PlanParams
 from lgrasp.runtime.device import Device, start
+from lgrasp.runtime.kernels import PREPARING
 
 OTHER = "other"
 
@@ -40,7 +41,7 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
     def watched(kernel, *args, **more):
         frame = next(f for f in reversed(traceback.extract_stack()) if "/lgrasp/" in f.filename)
         where = "cpu" if wp.get_device(more.get("device")) is runtime.device_map["cpu"] else OTHER
-        found[where].append(f"{Path(frame.filename).name}:{frame.lineno} {kernel.key}")
+        found[where].append(f"{Path(frame.filename).name}:{frame.lineno} {kernel.module.name} {kernel.key}")
         return launch(kernel, *args, **more)
 
     monkeypatch.setattr(wp, "launch", watched)
@@ -78,5 +79,5 @@ def test_inputs_are_made_on_the_cpu(launched, swift: Pipeline, tmp_path):
     inputs = load_inputs(cache, keys, 1.0, swift.object, swift.field, device)
     assert inputs.hand.struct.pieces.body.device.alias == OTHER
     assert not any(inputs.hits.values())
-    assert len(launched["cpu"]) > 10
+    assert {line.split()[1] for line in launched["cpu"]} == {f"lgrasp.{name}" for name in PREPARING}
     assert launched[OTHER] == []
