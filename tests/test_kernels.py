@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,3 +52,32 @@ def test_structs(name):
             if isinstance(field, ast.AnnAssign) and is_array(field.annotation):
                 comment = lines[field.lineno - 1].partition("#")[2]
                 assert re.search(r"\(.*\)", comment), f"{struct.name}: '{ast.unparse(field.target)}' has no shape"
+
+
+MADE = {"array", "empty", "zeros", "ones", "full", "launch", "launch_tiled", "HashGrid"}
+ON_ONE_THREAD = {"lgrasp/simulate/worlds.py", "lgrasp/simulate/noslip.py"}
+"""MuJoCo Warp goes by the default device."""
+
+
+def host_calls(node: ast.AST) -> Iterator[ast.Call]:
+    """Calls outside kernels, functions of kernels, and annotations."""
+    if any(ast.unparse(d).startswith(("wp.kernel", "wp.func")) for d in getattr(node, "decorator_list", ())):
+        return
+    if isinstance(node, ast.Call):
+        yield node
+    for name, value in ast.iter_fields(node):
+        for child in value if isinstance(value, list) else [value]:
+            if name != "annotation" and isinstance(child, ast.AST):
+                yield from host_calls(child)
+
+
+def test_device_is_named():
+    """Threads share Warp's default device: one that changes it for a while makes others launch elsewhere."""
+    for path in (ROOT / "lgrasp").rglob("*.py"):
+        if (name := path.relative_to(ROOT).as_posix()) in ON_ONE_THREAD:
+            continue
+        for call in host_calls(parse(path)):
+            what = ast.unparse(call.func)
+            assert what not in ("wp.ScopedDevice", "wp.set_device"), f"{name}:{call.lineno}"
+            if what in {f"wp.{made}" for made in MADE} and call.args:  # without any it is a type
+                assert any(k.arg in ("device", None) for k in call.keywords), f"{name}:{call.lineno} {what}"

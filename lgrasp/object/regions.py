@@ -78,14 +78,19 @@ def _inside(region: Region, points: np.ndarray, scale: float) -> np.ndarray:
 
 def _locate(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nearest face of each point (n,), barycentric coordinates there (n, 3), and whether it is inside (n,)."""
-    with wp.ScopedDevice("cpu"):
-        corners = wp.array(vertices, dtype=wp.vec3)
-        mesh = wp.Mesh(corners, wp.array(faces.ravel(), dtype=wp.int32), support_winding_number=True)
-        face, inside = (wp.empty(len(points), dtype=wp.int32) for _ in range(2))
-        foot = wp.empty(len(points), dtype=wp.vec3)
-        reach = 10.0 * float(np.ptp(np.vstack([vertices[np.unique(faces)], points]), axis=0).max())
-        wp.launch(locate_points, len(points), [mesh.id, wp.array(points, dtype=wp.vec3), reach], [face, foot, inside])
-        return to_numpy(face), to_numpy(foot).astype(float), to_numpy(inside) == 1
+    corners = wp.array(vertices, dtype=wp.vec3, device="cpu")
+    mesh = wp.Mesh(corners, wp.array(faces.ravel(), dtype=wp.int32, device="cpu"), support_winding_number=True)
+    face, inside = (wp.empty(len(points), dtype=wp.int32, device="cpu") for _ in range(2))
+    foot = wp.empty(len(points), dtype=wp.vec3, device="cpu")
+    reach = 10.0 * float(np.ptp(np.vstack([vertices[np.unique(faces)], points]), axis=0).max())
+    wp.launch(
+        locate_points,
+        len(points),
+        [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach],
+        [face, foot, inside],
+        device="cpu",
+    )
+    return to_numpy(face), to_numpy(foot).astype(float), to_numpy(inside) == 1
 
 
 def _corner_weights(region: Region, raw: RawMesh, path: Path) -> np.ndarray:

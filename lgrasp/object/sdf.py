@@ -56,21 +56,22 @@ def build_sdf(
     origin, cell, dims = _layout(vertices, max_cells, min_cell, pad)
     corners = _split(vertices[faces].astype(np.float32), _SPLIT_CELLS * cell)
     shape = wp.vec3i(*dims)
-    with wp.ScopedDevice("cpu"):
-        corners_d = wp.array(corners, dtype=wp.vec3)
-        key = wp.full(int(np.prod(dims)), np.iinfo(np.uint64).max, dtype=wp.uint64)
-        args = [wp.vec3(*origin.tolist()), cell, shape]
-        wp.launch(kernels.nearest_face_band, len(corners), [corners_d, *args, _BAND_CELLS * cell], [key])
-        face = to_numpy(key).view(np.uint32).reshape(-1, 2)[:, 0].view(np.int32)  # low word; -1 where no face came near
-        source = _nearest_band_cell(face.reshape(dims) < 0)  # (n,)
-        distance = wp.empty(len(face), dtype=float)
-        nearest = wp.array(face[source], dtype=wp.int32)
-        wp.launch(kernels.far_distance, len(face), [corners_d, nearest, *args, _BAND_CELLS * cell], [distance])
-        if closed:
-            inside = _closed_inside(vertices, faces, origin, cell, dims)
-        else:
-            inside = _open_inside(vertices, faces, np.flatnonzero(face >= 0), source, args, len(face))
-        values = to_numpy(distance).reshape(dims)
+    corners_d = wp.array(corners, dtype=wp.vec3, device="cpu")
+    key = wp.full(int(np.prod(dims)), np.iinfo(np.uint64).max, dtype=wp.uint64, device="cpu")
+    args = [wp.vec3(*origin.tolist()), cell, shape]
+    wp.launch(kernels.nearest_face_band, len(corners), [corners_d, *args, _BAND_CELLS * cell], [key], device="cpu")
+    face = to_numpy(key).view(np.uint32).reshape(-1, 2)[:, 0].view(np.int32)  # low word; -1 where no face came near
+    source = _nearest_band_cell(face.reshape(dims) < 0)  # (n,)
+    distance = wp.empty(len(face), dtype=float, device="cpu")
+    nearest = wp.array(face[source], dtype=wp.int32, device="cpu")
+    wp.launch(
+        kernels.far_distance, len(face), [corners_d, nearest, *args, _BAND_CELLS * cell], [distance], device="cpu"
+    )
+    if closed:
+        inside = _closed_inside(vertices, faces, origin, cell, dims)
+    else:
+        inside = _open_inside(vertices, faces, np.flatnonzero(face >= 0), source, args, len(face))
+    values = to_numpy(distance).reshape(dims)
     values = np.where(inside.reshape(dims), -values, values)
     return SdfGrid(np.ascontiguousarray(values, np.float32), origin, cell)
 
@@ -122,10 +123,10 @@ def _nearest_band_cell(far: np.ndarray) -> np.ndarray:
 def _closed_inside(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, cell: float, dims: tuple) -> np.ndarray:
     """Inside flags of all cells from the signed surface crossings of z columns."""
     shifted = origin.astype(np.float64) + cell * np.array(_LATTICE_SHIFT)
-    step = wp.zeros(dims, dtype=wp.int32)
-    mesh = [wp.array(vertices, dtype=wp.vec3d), wp.array(faces, dtype=wp.int32)]
+    step = wp.zeros(dims, dtype=wp.int32, device="cpu")
+    mesh = [wp.array(vertices, dtype=wp.vec3d, device="cpu"), wp.array(faces, dtype=wp.int32, device="cpu")]
     lattice = [wp.vec3d(*shifted.tolist()), cell, wp.vec3i(*dims)]
-    wp.launch(kernels.lattice_crossings, len(faces), [*mesh, *lattice], [step])
+    wp.launch(kernels.lattice_crossings, len(faces), [*mesh, *lattice], [step], device="cpu")
     return np.cumsum(to_numpy(step), axis=2, dtype=np.int32) > 0
 
 
@@ -133,11 +134,11 @@ def _open_inside(
     vertices: np.ndarray, faces: np.ndarray, band: np.ndarray, source: np.ndarray, args: list, count: int
 ) -> np.ndarray:
     """Inside flags: winding number in the band, elsewhere that of the nearest band cell."""
-    points = wp.array(vertices, dtype=wp.vec3)
-    mesh = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32), support_winding_number=True)
-    flag = wp.empty(len(band), dtype=wp.int32)
-    inputs = [mesh.id, wp.array(band, dtype=wp.int32), *args, 2.0 * _BAND_CELLS * args[1]]
-    wp.launch(kernels.winding_sign, len(band), inputs, [flag])
+    points = wp.array(vertices, dtype=wp.vec3, device="cpu")
+    mesh = wp.Mesh(points, wp.array(faces.ravel(), dtype=wp.int32, device="cpu"), support_winding_number=True)
+    flag = wp.empty(len(band), dtype=wp.int32, device="cpu")
+    inputs = [mesh.id, wp.array(band, dtype=wp.int32, device="cpu"), *args, 2.0 * _BAND_CELLS * args[1]]
+    wp.launch(kernels.winding_sign, len(band), inputs, [flag], device="cpu")
     inside = np.zeros(count, bool)
     inside[band] = to_numpy(flag) == 1
     return inside[source]

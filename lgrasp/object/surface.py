@@ -91,19 +91,18 @@ def fold_cosine(
         Cosines, shape (n,), f32; -1 beside an open edge. Small values mean a fold, an edge or scan noise.
     """
     normals, _ = face_normals(vertices, faces)
-    with wp.ScopedDevice("cpu"):
-        out = wp.empty(len(points), dtype=float)
-        inputs = [
-            wp.array(vertices[faces], dtype=wp.vec3),
-            wp.array(face_neighbours(faces), dtype=wp.int32),
-            wp.array(points, dtype=wp.vec3),
-            wp.array(normals[point_face], dtype=wp.vec3),
-            wp.array(point_face, dtype=wp.int32),
-            radius,
-            wp.empty((len(points), min(_WALK_FACES, len(faces))), dtype=wp.int32),
-        ]
-        wp.launch(kernels.fold_spread, len(points), inputs, [out])
-        return to_numpy(out)
+    out = wp.empty(len(points), dtype=float, device="cpu")
+    inputs = [
+        wp.array(vertices[faces], dtype=wp.vec3, device="cpu"),
+        wp.array(face_neighbours(faces), dtype=wp.int32, device="cpu"),
+        wp.array(points, dtype=wp.vec3, device="cpu"),
+        wp.array(normals[point_face], dtype=wp.vec3, device="cpu"),
+        wp.array(point_face, dtype=wp.int32, device="cpu"),
+        radius,
+        wp.empty((len(points), min(_WALK_FACES, len(faces))), dtype=wp.int32, device="cpu"),
+    ]
+    wp.launch(kernels.fold_spread, len(points), inputs, [out], device="cpu")
+    return to_numpy(out)
 
 
 def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int) -> np.ndarray:
@@ -118,11 +117,15 @@ def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int) -> np
     Returns:
         Indices, shape (n,), int32; -1 where there is none.
     """
-    with wp.ScopedDevice("cpu"):
-        out = wp.empty(len(points), dtype=wp.int32)
-        inputs = [wp.array(points, dtype=wp.vec3), wp.array(normals, dtype=wp.vec3), _OPPOSED, seed]
-        wp.launch(kernels.draw_opposite, len(points), inputs, [out])
-        return to_numpy(out)
+    out = wp.empty(len(points), dtype=wp.int32, device="cpu")
+    inputs = [
+        wp.array(points, dtype=wp.vec3, device="cpu"),
+        wp.array(normals, dtype=wp.vec3, device="cpu"),
+        _OPPOSED,
+        seed,
+    ]
+    wp.launch(kernels.draw_opposite, len(points), inputs, [out], device="cpu")
+    return to_numpy(out)
 
 
 def probe_fits(sdf: SdfGrid, points: np.ndarray, normals: np.ndarray, radius: float, tolerance: float) -> np.ndarray:

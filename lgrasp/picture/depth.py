@@ -54,23 +54,22 @@ def join_surfaces(surfaces: Sequence[LabelledMesh]) -> LabelledMesh:
 def render(surface: LabelledMesh, intrinsics: Intrinsics, pose: np.ndarray, device: str = "cpu") -> Images:
     """Exact depths and labels from v cameras at T_scene_camera, x y z [m] qw qx qy qz, shape (v, 7)."""
     start()
-    with wp.ScopedDevice(device):
-        mesh = wp.Mesh(
-            wp.array(np.asarray(surface.vertices, np.float32), dtype=wp.vec3),
-            wp.array(np.asarray(surface.faces, np.int32).ravel(), dtype=wp.int32),
-        )
-        shape = (len(pose), intrinsics.height, intrinsics.width)
-        depth, label = wp.empty(shape, dtype=wp.float32), wp.empty(shape, dtype=wp.int32)
-        inputs = [
-            mesh.id,
-            wp.array(np.asarray(surface.labels, np.int32), dtype=wp.int32),
-            wp.vec2(intrinsics.fx, intrinsics.fy),
-            wp.vec2(intrinsics.cx, intrinsics.cy),
-            _FAR,
-            wp.array(device_from_stored(pose), dtype=wp.transform),
-        ]
-        wp.launch(cast_rays, shape, inputs, [depth, label])
-        return Images(intrinsics, np.asarray(pose, float), to_numpy(depth), to_numpy(label))
+    mesh = wp.Mesh(
+        wp.array(np.asarray(surface.vertices, np.float32), dtype=wp.vec3, device=device),
+        wp.array(np.asarray(surface.faces, np.int32).ravel(), dtype=wp.int32, device=device),
+    )
+    shape = (len(pose), intrinsics.height, intrinsics.width)
+    depth, label = wp.empty(shape, dtype=wp.float32, device=device), wp.empty(shape, dtype=wp.int32, device=device)
+    inputs = [
+        mesh.id,
+        wp.array(np.asarray(surface.labels, np.int32), dtype=wp.int32, device=device),
+        wp.vec2(intrinsics.fx, intrinsics.fy),
+        wp.vec2(intrinsics.cx, intrinsics.cy),
+        _FAR,
+        wp.array(device_from_stored(pose), dtype=wp.transform, device=device),
+    ]
+    wp.launch(cast_rays, shape, inputs, [depth, label], device=device)
+    return Images(intrinsics, np.asarray(pose, float), to_numpy(depth), to_numpy(label))
 
 
 @wp.kernel

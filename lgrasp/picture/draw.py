@@ -120,24 +120,23 @@ def draw(painted: Sequence[Painted], dots: np.ndarray, view: Viewpoint) -> np.nd
     everything."""
     start()
     intrinsics = view.intrinsics
-    with wp.ScopedDevice("cpu"):
-        solids, mesh = _upload(painted)
-        points = dots if len(dots) else np.full((1, 3), 1e3)
-        far = np.linalg.norm(points - view.pose[:3], axis=1).min()
-        marks, dot_mesh = _upload([Painted(balls(points, _DOT * far * np.tan(np.radians(ANGLE / 2)), 3), CONTACT)])
-        camera, light = kernels.Camera(), kernels.Lighting()
-        camera.pose = wp.transform(*map(float, device_from_stored(view.pose[None])[0]))
-        camera.focal = wp.vec2(intrinsics.fx, intrinsics.fy)
-        camera.centre = wp.vec2(intrinsics.cx, intrinsics.cy)
-        R = np.asarray(wp.quat_to_matrix(wp.transform_get_rotation(camera.pose))).reshape(3, 3)
-        towards = R @ np.array([-0.5, -0.75, -0.75])  # over the left shoulder
-        light.towards = wp.vec3(*map(float, towards / np.linalg.norm(towards)))
-        light.sun, light.shine, light.softness, light.reach = 0.9, 0.06, 0.25, 0.06
-        light.above, light.below = wp.vec3(0.50, 0.52, 0.55), wp.vec3(0.28, 0.26, 0.25)
-        light.samples, light.rays, light.through = _SAMPLES, _RAYS, _THROUGH
-        out = wp.empty((intrinsics.height, intrinsics.width), dtype=wp.vec3)
-        wp.launch(kernels.shade, out.shape, [solids, marks, camera, light, wp.vec3(1.0, 1.0, 1.0)], [out])
-        colour = np.clip(to_numpy(out), 0, 1)
+    solids, mesh = _upload(painted)
+    points = dots if len(dots) else np.full((1, 3), 1e3)
+    far = np.linalg.norm(points - view.pose[:3], axis=1).min()
+    marks, dot_mesh = _upload([Painted(balls(points, _DOT * far * np.tan(np.radians(ANGLE / 2)), 3), CONTACT)])
+    camera, light = kernels.Camera(), kernels.Lighting()
+    camera.pose = wp.transform(*map(float, device_from_stored(view.pose[None])[0]))
+    camera.focal = wp.vec2(intrinsics.fx, intrinsics.fy)
+    camera.centre = wp.vec2(intrinsics.cx, intrinsics.cy)
+    R = np.asarray(wp.quat_to_matrix(wp.transform_get_rotation(camera.pose))).reshape(3, 3)
+    towards = R @ np.array([-0.5, -0.75, -0.75])  # over the left shoulder
+    light.towards = wp.vec3(*map(float, towards / np.linalg.norm(towards)))
+    light.sun, light.shine, light.softness, light.reach = 0.9, 0.06, 0.25, 0.06
+    light.above, light.below = wp.vec3(0.50, 0.52, 0.55), wp.vec3(0.28, 0.26, 0.25)
+    light.samples, light.rays, light.through = _SAMPLES, _RAYS, _THROUGH
+    out = wp.empty((intrinsics.height, intrinsics.width), dtype=wp.vec3, device="cpu")
+    wp.launch(kernels.shade, out.shape, [solids, marks, camera, light, wp.vec3(1.0, 1.0, 1.0)], [out], device="cpu")
+    colour = np.clip(to_numpy(out), 0, 1)
     del mesh, dot_mesh  # kept alive until here
     srgb = np.where(colour < 0.0031308, 12.92 * colour, 1.055 * colour ** (1 / 2.4) - 0.055)
     return np.rint(255 * srgb).astype(np.uint8)
@@ -151,14 +150,14 @@ def _upload(painted: Sequence[Painted]) -> tuple[Any, wp.Mesh]:
         for part in painted
     ]
     mesh = wp.Mesh(
-        wp.array(whole.vertices.astype(np.float32), dtype=wp.vec3),
-        wp.array(whole.faces.ravel().astype(np.int32), dtype=wp.int32),
+        wp.array(whole.vertices.astype(np.float32), dtype=wp.vec3, device="cpu"),
+        wp.array(whole.faces.ravel().astype(np.int32), dtype=wp.int32, device="cpu"),
     )
     solids = kernels.PaintedMesh()
     solids.mesh = mesh.id
     normals = whole.vertex_normals[whole.faces].reshape(-1, 3)
-    solids.corner_normal = wp.array(normals.astype(np.float32), dtype=wp.vec3)
-    solids.colour = wp.array(np.concatenate(colours).astype(np.float32), dtype=wp.vec3)
+    solids.corner_normal = wp.array(normals.astype(np.float32), dtype=wp.vec3, device="cpu")
+    solids.colour = wp.array(np.concatenate(colours).astype(np.float32), dtype=wp.vec3, device="cpu")
     return solids, mesh
 
 

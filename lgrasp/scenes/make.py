@@ -66,19 +66,18 @@ def find_collisions(
     inward = inverse(object_pose)
     inward[:, :3] -= np.stack([o.model.center for o in objects])  # to the internal frames
     body = body_poses(hand, np.concatenate([q_pregrasp, q]))
-    with wp.ScopedDevice(device):
-        table, obstacle = (wp.zeros(2 * n, dtype=wp.float32) for _ in range(2))
-        inputs = [
-            hand.struct,
-            wp.array([o.struct for o in objects], dtype=Object),
-            own,
-            wp.array(device_from_stored(inward), dtype=wp.transform),
-            wp.array(device_from_stored(np.concatenate([hand_pose, hand_pose])), dtype=wp.transform),
-            wp.array(body, dtype=wp.transform),
-            limit,
-        ]
-        wp.launch(kernels.hand_depths, body.shape[:2], inputs, [table, obstacle])
-        return Collisions(*(to_numpy(depth).reshape(2, n).T.copy() for depth in (table, obstacle)))
+    table, obstacle = (wp.zeros(2 * n, dtype=wp.float32, device=device) for _ in range(2))
+    inputs = [
+        hand.struct,
+        wp.array([o.struct for o in objects], dtype=Object, device=device),
+        own,
+        wp.array(device_from_stored(inward), dtype=wp.transform, device=device),
+        wp.array(device_from_stored(np.concatenate([hand_pose, hand_pose])), dtype=wp.transform, device=device),
+        wp.array(body, dtype=wp.transform, device=device),
+        limit,
+    ]
+    wp.launch(kernels.hand_depths, body.shape[:2], inputs, [table, obstacle], device=device)
+    return Collisions(*(to_numpy(depth).reshape(2, n).T.copy() for depth in (table, obstacle)))
 
 
 class Item(NamedTuple):

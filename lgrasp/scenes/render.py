@@ -45,12 +45,11 @@ def image_normals(images: Images, window: int, device: str) -> np.ndarray:
     through ``window`` pixels to each side; zero where too few of them lie on the same surface."""
     start()
     points = images.intrinsics.points(images.depth).astype(np.float32)
-    with wp.ScopedDevice(device):
-        out = wp.empty(images.depth.shape, dtype=wp.vec3)
-        step = _SLOPE / min(images.intrinsics.fx, images.intrinsics.fy)
-        inputs = [wp.array(points, dtype=wp.vec3), window, step]
-        wp.launch(fit_normals, images.depth.shape, inputs, [out])
-        normals = to_numpy(out)
+    out = wp.empty(images.depth.shape, dtype=wp.vec3, device=device)
+    step = _SLOPE / min(images.intrinsics.fx, images.intrinsics.fy)
+    inputs = [wp.array(points, dtype=wp.vec3, device=device), window, step]
+    wp.launch(fit_normals, images.depth.shape, inputs, [out], device=device)
+    normals = to_numpy(out)
     R = pose_matrix(images.pose)[:, :3, :3].astype(np.float32)
     return np.einsum("vab,vhwb->vhwa", R, normals)
 
