@@ -6,6 +6,12 @@ def short_reason(error: BaseException, most: int = 200) -> str:
     return " ".join(str(error).split())[:most] or type(error).__name__
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error of Python or of a library is that no memory was left, of the computer or of a GPU."""
+    words = str(error).lower()
+    return isinstance(error, MemoryError) or "out of memory" in words or "failed to allocate" in words
+
+
 class LgraspError(Exception):
     """Base of every error that lgrasp raises on purpose; the command line prints it on one line and exits."""
 

@@ -8,7 +8,7 @@ import typer
 
 def explain(error: BaseException) -> tuple[str, int]:
     """One line for the user and the exit code of a failure."""
-    from lgrasp.errors import LgraspError
+    from lgrasp.errors import LgraspError, is_out_of_memory
 
     if isinstance(error, LgraspError):
         return f"error: {error}", error.exit_code
@@ -22,7 +22,7 @@ def explain(error: BaseException) -> tuple[str, int]:
         return "", 141
     if isinstance(error, SystemExit):
         return "", error.code if isinstance(error.code, int) else 1
-    if isinstance(error, MemoryError) or "out of memory" in str(error).lower():
+    if is_out_of_memory(error):
         return "error: out of memory; lower --workers, or --batch or --shard-rows if the command has them", 2
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""

@@ -26,7 +26,7 @@ from lgrasp.grasp.records import GraspRows, Shard
 from lgrasp.grasp.schema import GRASP_FIELDS
 from lgrasp.hold.run import METRICS
 from lgrasp.jobs.generate import GenerateJob
-from lgrasp.jobs.refine import shards
+from lgrasp.jobs.refine import moved, shards
 from lgrasp.jobs.refine.shards import RefineJob, move_rows
 from lgrasp.jobs.simulate import SimulateJob
 from lgrasp.judge.run import judge
@@ -313,3 +313,22 @@ def test_grasps_shaken_by_millimetres_are_recovered(job, refine, tmp_path):
     assert report.valid.all(), report
     assert len(report.valid) >= 0.85 * rows
     assert numbers(done)[0][0] < 0.1 * rows
+
+
+def test_rows_are_moved_in_smaller_parts_where_memory_runs_out(source, done, refine, tmp_path, monkeypatch):
+    sizes, move = [], moved._moved_part
+
+    def short(*args):
+        part = next(a for a in args if isinstance(a, slice))
+        sizes.append(part.stop - part.start)
+        if sizes[-1] > 4:
+            raise RuntimeError("Failed to allocate 490680320 bytes on device 'cuda:0'")
+        return move(*args)
+
+    monkeypatch.setattr(moved, "_moved_part", short)
+    monkeypatch.setattr(moved, "_batch_rows", lambda device: 16)
+    monkeypatch.setattr(moved, "_BATCH_ROWS", 4)
+    found, whole = (read_shard(path).grasps for path in (refine(source, tmp_path), done))
+    assert sizes[:3] == [16, 8, 4]
+    np.testing.assert_array_equal(found.q, whole.q)
+    np.testing.assert_array_equal(found.object_pose, whole.object_pose)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from lgrasp.errors import is_out_of_memory
 from lgrasp.geometry.poses import internal_poses
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.grasp.check import known_contacts
@@ -87,13 +88,20 @@ def move_rows(
     model = arrays.model
     refiner = Refiner(hand.model, model, params, device=hand.device)
     outside = _outside(rows, hand)
-    parts = []
-    size = _batch_rows(hand.device)
-    for first in range(0, len(rows), size):
+    parts: list[_Part] = []
+    first, size = 0, _batch_rows(hand.device)
+    while first < len(rows):
         part = slice(first, first + size)
-        parts.append(_moved_part(refiner, hand, arrays, rows, part, params, bounds, asked, stored))
+        try:
+            parts.append(_moved_part(refiner, hand, arrays, rows, part, params, bounds, asked, stored))
+        except RuntimeError as error:
+            if size <= _BATCH_ROWS or not is_out_of_memory(error):
+                raise
+            size = max(size // 2, _BATCH_ROWS)  # others use the GPU, too
+            continue
+        first = part.stop
         if progress:
-            progress(min(first + size, len(rows)))
+            progress(min(first, len(rows)))
     table = join_rows([p.table for p in parts])
     first_energy, last_energy = (np.concatenate(x, 1) for x in zip(*(p.energy for p in parts), strict=True))
     was, known, taken, good, failed = (np.concatenate([p.marks[k] for p in parts]) for k in range(5))
@@ -114,10 +122,10 @@ def move_rows(
 
 
 def _batch_rows(device: str) -> int:
-    """How many rows are moved at a time: on a GPU more, as many as have place there."""
+    """How many rows are moved at a time: on a GPU more, in half of the memory that is free, as kernels need some."""
     if device == "cpu":
         return _BATCH_ROWS
-    return int(np.clip(wp.get_device(device).free_memory // _ROW_BYTES, _BATCH_ROWS, _GPU_BATCH_ROWS))
+    return int(np.clip(wp.get_device(device).free_memory / 2 // _ROW_BYTES, _BATCH_ROWS, _GPU_BATCH_ROWS))
 
 
 class _Part(NamedTuple):
