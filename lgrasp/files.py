@@ -25,6 +25,7 @@ try:
 except ImportError:  # Windows: leftovers cannot be distinguished from files being written
     fcntl = None
 
+_LONGEST_NAME = 255  # bytes, of a file
 _TEMPORARY = re.compile(r"\.([0-9a-f]{6})[0-9a-f]{6}-[0-9a-f]{12}\b")  # the computer in a temporary file's name
 FOREIGN_AGE = 86_400.0
 """Seconds after which temporary files of other computers are left over."""
@@ -298,12 +299,20 @@ def remove_leftovers(folder: Path, pattern: str) -> list[Path]:
 def _remove_left(path: Path) -> None:
     """Remove what killed processes left of a file or folder."""
     tag = f"{12 * '?'}-{12 * '?'}"
-    remove_leftovers(path.parent, f"{glob.escape(path.stem)}.{tag}{glob.escape(path.suffix)}.tmp")
+    remove_leftovers(path.parent, f"{glob.escape(_short_stem(path))}.{tag}{glob.escape(path.suffix)}.tmp")
+
+
+def _short_stem(path: Path) -> str:
+    """The name of a file without its suffix, cut so that its temporary names are no longer than a name may be."""
+    stem, most = path.stem, _LONGEST_NAME - len(os.fsencode(f".{12 * '-'}-{12 * '-'}{path.suffix}.tmp"))
+    while len(os.fsencode(stem)) > most > 0:
+        stem = stem[:-1]
+    return stem
 
 
 def _unique(path: Path) -> Path:
     """Name of a temporary file or folder beside a path."""
-    return path.with_name(f"{path.stem}.{_machine()}-{uuid.uuid4().hex[:12]}{path.suffix}.tmp")
+    return path.with_name(f"{_short_stem(path)}.{_machine()}-{uuid.uuid4().hex[:12]}{path.suffix}.tmp")
 
 
 def _hold(path: Path, make: Callable[[Path], int | None]) -> Path:

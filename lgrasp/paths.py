@@ -3,6 +3,7 @@
 import glob
 import os
 from collections.abc import Callable, Container, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import platformdirs
@@ -29,12 +30,27 @@ def data_dirs(kind: str) -> list[Path]:
     roots = [user_path(p) for p in os.environ.get("LGRASP_PATH", "").split(os.pathsep) if p]
     for root in roots:
         notice("" if os.path.isdir(root) else f"LGRASP_PATH: {root} is no folder")
-    return [p for p in (*(root / kind for root in roots), user_dir(kind), shipped) if os.path.isdir(p)]
+    places = [*(root / kind for root in roots), shipped]
+    with suppress(ConfigError):
+        places.insert(-1, user_dir(kind))
+    return [place for place in places if os.path.isdir(place)]
 
 
 def user_dir(kind: str) -> Path:
-    """The user's own folder of one kind (see :func:`data_dirs`), which need not exist."""
-    return Path(platformdirs.user_data_dir("lgrasp")) / kind
+    """The user's own folder of one kind (see :func:`data_dirs`), which need not exist.
+
+    Raises:
+        ConfigError: the user has no home folder.
+    """
+    return _home(platformdirs.user_data_dir, "XDG_DATA_HOME") / kind
+
+
+def _home(find: Callable[[str], str], variable: str) -> Path:
+    """A folder in the user's home."""
+    try:
+        return Path(find("lgrasp"))
+    except RuntimeError:
+        raise ConfigError(f"this user has no home folder; set HOME or {variable} to a whole path") from None
 
 
 def pip_line(distribution: str) -> str:
@@ -73,11 +89,15 @@ def user_path(name: str | os.PathLike[str]) -> Path:
 
 
 def cache_dir(override: str | os.PathLike[str] | None = None) -> Path:
-    """The cache folder: ``override``, else ``LGRASP_CACHE_DIR``, else the platform's user cache folder."""
+    """The cache folder: ``override``, else ``LGRASP_CACHE_DIR``, else the platform's user cache folder.
+
+    Raises:
+        ConfigError: none of them is there, as the user has no home folder.
+    """
     if override:
         return user_path(override)
     env = os.environ.get("LGRASP_CACHE_DIR")
-    return user_path(env) if env else Path(platformdirs.user_cache_dir("lgrasp"))
+    return user_path(env) if env else _home(platformdirs.user_cache_dir, "LGRASP_CACHE_DIR")
 
 
 def check_input(path: Path, suffixes: Sequence[str], what: str, error: type[LgraspError]) -> None:

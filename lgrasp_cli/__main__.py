@@ -1,6 +1,7 @@
 """The process ``lgrasp``: it heeds signals before the command line is loaded, and leaves nothing and at once."""
 
 import atexit
+import io
 import os
 import sys
 import tempfile
@@ -10,11 +11,14 @@ from lgrasp_cli.stopping import heed_signals
 
 
 def _fill_streams() -> None:
-    """Standard streams that are closed lead nowhere; else the next file that is opened takes their place, and words."""
+    """Standard streams that are closed lead nowhere; else the next file that is opened takes their place, and words.
+    Others take the name of every file."""
     while (nowhere := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(nowhere)
     sys.stdout, sys.stderr = sys.stdout or os.fdopen(1, "w"), sys.stderr or os.fdopen(2, "w")
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not fit what the terminal can show
+        sys.stdout.reconfigure(errors="surrogateescape" if sys.stdout.encoding == "utf-8" else "backslashreplace")
 
 
 def _gather_temporaries() -> None:

@@ -1,5 +1,6 @@
 """A failure in one line for the user, with its exit code."""
 
+import os
 import re
 import sys
 
@@ -24,10 +25,21 @@ def explain(error: BaseException) -> tuple[str, int]:
         return "", error.code if isinstance(error.code, int) else 1
     if is_out_of_memory(error):
         return "error: out of memory; lower --workers, or --batch or --shard-rows if the command has them", 2
+    if "can't start new thread" in str(error):
+        return "error: no more threads or processes are allowed here (ulimit -u, or a container's limit)", 2
+    if isinstance(error, FileNotFoundError) and not error.filename and not _has_folder():
+        return "error: the current folder is not there any more; change to another one", 2
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
         return f"error: {where}{error.strerror}", 2
     return f"error: unexpected {type(error).__name__}: {error} (set LGRASP_DEBUG=1 for the traceback)", 1
+
+
+def _has_folder() -> bool:
+    try:
+        return bool(os.getcwd())
+    except OSError:
+        return False
 
 
 def _extra_word(error: typer.TyperException) -> str:

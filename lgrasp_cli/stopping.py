@@ -29,7 +29,8 @@ def heed_signals() -> None:
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
     numbers = stop_signals()
-    _thread.start_new_thread(_watch, (reading, frozenset(numbers)))
+    with suppress(RuntimeError):  # no more threads are allowed
+        _thread.start_new_thread(_watch, (reading, frozenset(numbers)))
     for number in numbers:
         signal.signal(number, lambda number, frame: stop_now())
 

@@ -139,7 +139,9 @@ def _script(options: dict[str, str], words: list[str]) -> str:
     ]
     if "array" in options:  # tasks that are submitted again know the whole
         kept.append(f"export {SUBMITTED}={shlex.quote(options['array'])}")
-    run = shlex.join([sys.executable, "-m", "lgrasp_cli", *words])
+    # no module of the folder that it runs in gets in the way, unless that is where lgrasp is
+    alone = [] if Path.cwd() == Path(__file__).resolve().parents[1] else ["-P"]
+    run = shlex.join([sys.executable, *alone, "-m", "lgrasp_cli", *words])
     return "\n".join(["#!/bin/bash", *lines, f"cd {shlex.quote(os.getcwd())} || exit 2", *kept, f"exec {run}"]) + "\n"
 
 

@@ -6,12 +6,13 @@ Light to import: a file or folder that is not there is told at once.
 import hashlib
 import mmap
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from struct import unpack_from
 
 from lgrasp.errors import ShardError, short_reason
+from lgrasp.notices import notice
 from lgrasp.paths import is_litter
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -88,16 +89,22 @@ def folders_below(paths: Paths, *, deep: bool = True) -> list[Path]:
     return list(dict.fromkeys(f for t in tops for f in (t, *sorted({s.parent for s in files_in(t, deep=deep)}))))
 
 
-def walk(top: Path, *, hidden: bool = True) -> Iterator[tuple[Path, list[str]]]:
-    """A folder and those below it, each once, with the names of their files; ``hidden``: also those whose names begin
-    with a dot. Links to folders elsewhere are followed."""
+def walk(
+    top: Path, *, hidden: bool = True, unread: Callable[[OSError], None] | None = None
+) -> Iterator[tuple[Path, list[str]]]:
+    """A folder and those below it, each once, with the names of their files. Links to folders elsewhere are followed.
+
+    Args:
+        hidden: also those whose names begin with a dot.
+        unread: given why a folder cannot be read, which is told as a notice by default.
+    """
     real, seen = top.resolve(), set()
 
     def is_new(folder: Path) -> bool:
         target = folder.resolve()
         return not folder.is_symlink() or not (target.is_relative_to(real) or real.is_relative_to(target))
 
-    for name, below, files in os.walk(top, followlinks=True):
+    for name, below, files in os.walk(top, onerror=unread or _left_out, followlinks=True):
         here = Path(name)
         if (place := here.resolve()) in seen:
             below.clear()
@@ -105,6 +112,19 @@ def walk(top: Path, *, hidden: bool = True) -> Iterator[tuple[Path, list[str]]]:
         seen.add(place)
         below[:] = sorted(f for f in below if (hidden or not f.startswith(".")) and is_new(here / f))
         yield here, files
+
+
+def _left_out(error: OSError) -> None:
+    notice(f"folder {error.filename} is left out: {error.strerror}")
+
+
+def unread_folders(paths: Paths) -> dict[str, str]:
+    """Why folders among some paths or below them cannot be read, by name."""
+    found: list[OSError] = []
+    for top in given_paths(paths):
+        for _ in walk(top, unread=found.append):
+            pass
+    return {str(error.filename): error.strerror or "" for error in found}
 
 
 def files_in(folder: Path, *, deep: bool = False) -> list[Path]:

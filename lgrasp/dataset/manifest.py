@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from lgrasp.config import parse_model
-from lgrasp.dataset.files import Paths, find_shards, folders_below, parsing, sha256, shards_below
+from lgrasp.dataset.files import Paths, find_shards, folders_below, parsing, sha256, shards_below, unread_folders
 from lgrasp.errors import ConfigError, OutputError, ShardError
 from lgrasp.files import held_file, is_held, locked, write_file
 from lgrasp.notices import notice
@@ -362,6 +362,7 @@ def check_files(paths: Paths, check: Callable[[Path], list[str]], *, below: bool
     """
     files = [path for path, _ in shards_below(paths)] if below else find_shards(paths)
     problems = {str(path): check(path) for path in files}
+    problems |= {folder: [why] for folder, why in (unread_folders(paths).items() if below else ())}
     for folder in folders_below(paths, deep=below):
         path = folder / MANIFEST
         try:

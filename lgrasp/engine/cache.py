@@ -157,10 +157,15 @@ class Cache:
     def prune(self, kinds: set[str] | None = None, older_than: float | None = None) -> tuple[int, int]:
         """Remove artifacts (of some kinds, last written before a time [s since 1970]); returns (files, bytes)."""
         files = size = 0
+        kept: list[str] = []
         for entry in self.entries():
             if (kinds is None or entry.kind in kinds) and (older_than is None or entry.modified < older_than):
-                entry.path.unlink(missing_ok=True)
-                files, size = files + 1, size + entry.size
+                try:
+                    entry.path.unlink(missing_ok=True)
+                except OSError as error:
+                    kept.append(f"{entry.path}: {error.strerror}")
+                else:
+                    files, size = files + 1, size + entry.size
         for folder in (self.root / "variants").glob("*/") if kinds is None else ():
             if older_than is None or folder.stat().st_mtime < older_than:
                 found = [path for path in folder.rglob("*") if path.is_file()]
@@ -169,6 +174,8 @@ class Cache:
         remove_leftovers(self.root, "*/*.tmp")
         for folder in (self.root / "kernels").glob("*/"):
             remove_unfinished(folder)
+        if kept:
+            self.warn(f"{len(kept):,} that this user cannot remove stay, first {kept[0]}")
         return files, size
 
     def kernel_bytes(self) -> int:

@@ -31,7 +31,7 @@ def _inside(top: Path) -> list[Path]:
     """Shards in a folder and those below it, sorted; each folder once. macOS puts a ``._NAME`` beside some files."""
     found: list[Path] = []
     seen: set[str] = set()
-    for folder, below, names in os.walk(top, followlinks=True):
+    for folder, below, names in os.walk(top, onerror=_refuse, followlinks=True):
         if (real := os.path.realpath(folder)) in seen:
             below.clear()
             continue
@@ -39,6 +39,10 @@ def _inside(top: Path) -> list[Path]:
         below.sort()
         found += [Path(folder, name) for name in names if name.endswith(".h5") and not name.startswith("._")]
     return sorted(found)
+
+
+def _refuse(error: OSError) -> None:
+    raise JudgeError(f"{error.filename}: {error.strerror}; folders that can be read are accepted")
 
 
 def existing(path: str | Path) -> Path:

@@ -142,7 +142,7 @@ def _resolver(blobs: Mapping[str, bytes], folder: Path | None) -> Callable[[str]
 
 def read_hand(group: h5py.Group, urdf: Path | None) -> tuple[JudgedHand, str]:
     """The hand of a shard, or of a URDF in its place, and the key of its content."""
-    text = urdf.read_text() if urdf is not None else _text(_array(group, "urdf"))
+    text = urdf.read_text(encoding="utf-8") if urdf is not None else _text(_array(group, "urdf"))
     meshes = group.get("meshes", {})
     blobs = {_text(meshes[name].attrs["path"]): _array(meshes, name).tobytes() for name in meshes}
     base = _text(group.attrs["base_link"]) if "base_link" in group.attrs else None

@@ -73,7 +73,7 @@ def find_object(name_or_path: str | os.PathLike[str]) -> Path:
             cannot be used.
     """
     path = user_path(name_or_path)
-    if path.is_file():
+    if os.path.isfile(path):  # False also where the current folder cannot be searched
         if problem := name_problem(path.stem):
             raise ObjectError(f"object {str(path)!r}: a mesh file cannot have this name: {problem}")
         return path

@@ -168,5 +168,6 @@ def _slurm(environment: Mapping[str, str]) -> Array:
         )
     except KeyError as error:
         raise ConfigError(f"{error.args[0]} is not set; give --array I/N or --array off") from None
-    except ValueError as error:
-        raise ConfigError(f"SLURM_ARRAY_TASK_*: {error}; give --array I/N or --array off") from None
+    except ValueError:
+        told = ", ".join(f"{name}={environment[name]}" for name in names if name in environment)
+        raise ConfigError(f"{told}: whole numbers are accepted; give --array I/N or --array off") from None

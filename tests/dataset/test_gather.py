@@ -1,5 +1,6 @@
 """Which shards a command works on: a folder may hold folders, files that cannot be used, and the same rows twice."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +11,15 @@ from support.shards import sample_shard
 from lgrasp import notices
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.info import describe
+from lgrasp.dataset.manifest import check_files
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.writer import write_shard
 from lgrasp.errors import ShardError
 from lgrasp.grasp.schema import MADE_FROM
+from lgrasp.judge.bounds import JudgeError
+from lgrasp.judge.files import find_shards as judged_files
 
 
 def write(path, index, run="a", rows=3, **statistics):
@@ -59,6 +63,25 @@ def test_links_to_folders_are_followed_once(tmp_path):
     assert found == [tmp_path / "top" / "b" / "bowl" / "0.h5", inside]
     assert found[0].samefile(outside)
     assert {Path(state["folder"]) for state in folder_states([tmp_path / "top"])} == {path.parent for path in found}
+
+
+def test_folders_that_cannot_be_read_are_told(tmp_path, said, monkeypatch):
+    """A check does not pass on what it did not see."""
+    write(tmp_path / "top" / "mug" / "0.h5", 0)
+    closed = write(tmp_path / "top" / "bowl" / "0.h5", 1).parent
+    scan = os.scandir
+
+    def refuse(path):
+        if Path(path) == closed:
+            raise PermissionError(13, "Permission denied", str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    assert [shard.path.parent.name for shard in gather(tmp_path / "top")] == ["mug"]
+    assert said == [f"folder {closed} is left out: Permission denied"]
+    assert check_files(tmp_path / "top", lambda path: [])[str(closed)] == ["Permission denied"]
+    with pytest.raises(JudgeError, match="bowl: Permission denied"):
+        judged_files([tmp_path / "top"])
 
 
 def test_what_cannot_be_used_is_left_out(tmp_path, said):

@@ -195,6 +195,22 @@ def test_prune(cache):
     assert not variant.exists()
 
 
+def test_entries_of_others_stay_when_a_cache_is_pruned(cache, lines, monkeypatch):
+    for kind in ("hand", "bank"):
+        cache.store(kind, "key", ARRAYS)
+    unlink = Path.unlink
+
+    def refuse(path: Path, **options) -> None:
+        if path.parent.name == "bank":
+            raise PermissionError(1, "Operation not permitted", str(path))
+        unlink(path, **options)
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    assert cache.prune()[0] == 1
+    assert [entry.kind for entry in cache.entries()] == ["bank"]
+    assert lines == [f"1 that this user cannot remove stay, first {cache.path('bank', 'key')}: Operation not permitted"]
+
+
 def test_prune_leaves_kernels_that_are_being_compiled(cache):
     version = cache.root / "kernels" / "1.0"
     for name in ("wp_a_123", "wp_b_456", "wp_c_789_p12_t34"):

@@ -157,6 +157,7 @@ def test_pipelines(cli, tmp_path, text, words):
 def test_unexpected_failures_are_one_line(generate, monkeypatch):
     for error, words in (
         (MemoryError(), "out of memory"),
+        (RuntimeError("can't start new thread"), "no more threads"),
         (RuntimeError("Failed to allocate 112419840 bytes on device 'cuda:0'"), "out of memory"),
         (OSError(28, "No space left on device", "x.h5"), "x.h5: No space left"),
     ):

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import platformdirs
 import pytest
 import typer
 from support.fresh import HEAVY, SLOW, loaded
@@ -12,6 +13,9 @@ from support.kernels import kernel_folder
 from support.places import TINY_SHARD
 
 import lgrasp
+from lgrasp.errors import ConfigError
+from lgrasp.hand.find import find_hand
+from lgrasp.paths import cache_dir, user_dir
 from lgrasp_cli.main import app
 
 GROUPS = ("hands", "objects", "pipelines", "cache", "dataset", "scenes", "learn")
@@ -133,3 +137,30 @@ command.main()
 import mujoco
 """
     assert loaded(code, ["glfw"]) == []
+
+
+def test_names_that_the_terminal_cannot_show_are_no_failure(tmp_path):
+    """Bytes of another encoding come out as they are; characters that another encoding lacks, escaped."""
+    for name, encoding, shown in (
+        (b"bad\xff", "utf-8:strict", b"bad\xff"),
+        ("日".encode(), "latin-1:strict", b"\\u65e5"),
+    ):
+        given = os.fsencode(tmp_path) + b"/" + name
+        environment = os.environ | {"PYTHONIOENCODING": encoding, "LC_ALL": "C.UTF-8"}
+        command = [sys.executable, "-m", "lgrasp_cli", "cache", "path", "--cache-dir", given]
+        told = subprocess.run(command, capture_output=True, env=environment, check=True)
+        assert told.stdout.rstrip().endswith(shown)
+
+
+def test_a_user_without_a_home(monkeypatch):
+    def refuse(name):
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.delenv("LGRASP_CACHE_DIR", raising=False)
+    for name in ("user_data_dir", "user_cache_dir"):
+        monkeypatch.setattr(platformdirs, name, refuse)
+    assert find_hand("allegro").name == "allegro"
+    with pytest.raises(ConfigError, match="no home folder; set HOME or LGRASP_CACHE_DIR"):
+        cache_dir()
+    with pytest.raises(ConfigError, match="no home folder; set HOME or XDG_DATA_HOME"):
+        user_dir("hands")

@@ -47,7 +47,7 @@ def test_a_command_is_submitted_with_its_words_and_this_python(cli, sbatch, tmp_
     script = (tmp_path / "bin" / "script").read_text()
     assert script == (tmp_path / "my logs" / "lgrasp-generate-4711.sh").read_text()
     assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
-    assert command(script) == ["exec", sys.executable, "-m", "lgrasp_cli", *words, "--device", "cuda"]
+    assert command(script) == ["exec", sys.executable, "-P", "-m", "lgrasp_cli", *words, "--device", "cuda"]
     lines = script.splitlines()
     for line in ("--array=0-2", "--gres=gpu:2", "--time=1:00:00", "--qos='a b'", "--job-name=lgrasp-generate"):
         assert f"#SBATCH {line}" in lines

@@ -36,8 +36,10 @@ def test_what_the_option_accepts():
             parse_array(text)
     with pytest.raises(ConfigError, match="SLURM_ARRAY_TASK_COUNT is not set; give --array"):
         parse_array("auto", {f"SLURM_ARRAY_TASK_{name}": "3" for name in ("ID", "MIN", "MAX", "STEP")})
-    with pytest.raises(ConfigError, match=r"invalid literal .* give --array"):
+    with pytest.raises(ConfigError, match=r"SLURM_ARRAY_TASK_ID=x, SLURM_.*=x: whole numbers .* give --array"):
         parse_array("auto", {f"SLURM_ARRAY_TASK_{name}": "x" for name in ("ID", "MIN", "MAX", "STEP", "COUNT")})
+    with pytest.raises(ConfigError, match="SLURM_ARRAY_TASK_ID=x: whole numbers"):
+        parse_array("auto", {"SLURM_ARRAY_TASK_ID": "x"})
 
 
 @pytest.mark.parametrize(
