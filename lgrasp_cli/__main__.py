@@ -1,6 +1,7 @@
 """The process ``lgrasp``: it heeds signals before the command line is loaded, and leaves nothing and at once."""
 
 import atexit
+import codecs
 import io
 import os
 import sys
@@ -18,7 +19,9 @@ def _fill_streams() -> None:
     os.close(nowhere)
     sys.stdout, sys.stderr = sys.stdout or os.fdopen(1, "w"), sys.stderr or os.fdopen(2, "w")
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not fit what the terminal can show
-        sys.stdout.reconfigure(errors="surrogateescape" if sys.stdout.encoding == "utf-8" else "backslashreplace")
+        sys.stdout.reconfigure(
+            errors="surrogateescape" if codecs.lookup(sys.stdout.encoding).name == "utf-8" else "backslashreplace"
+        )
 
 
 def _gather_temporaries() -> None:

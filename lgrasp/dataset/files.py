@@ -122,7 +122,7 @@ def unread_folders(paths: Paths) -> dict[str, str]:
     """Why folders among some paths or below them cannot be read, by name."""
     found: list[OSError] = []
     for top in given_paths(paths):
-        for _ in walk(top, unread=found.append):
+        for _ in walk(top, unread=found.append) if top.is_dir() else ():
             pass
     return {str(error.filename): error.strerror or "" for error in found}
 

@@ -80,6 +80,9 @@ def test_folders_that_cannot_be_read_are_told(tmp_path, said, monkeypatch):
     assert [shard.path.parent.name for shard in gather(tmp_path / "top")] == ["mug"]
     assert said == [f"folder {closed} is left out: Permission denied"]
     assert check_files(tmp_path / "top", lambda path: [])[str(closed)] == ["Permission denied"]
+    assert check_files(tmp_path / "top" / "mug" / "0.h5", lambda path: []) == {
+        str(tmp_path / "top" / "mug" / "0.h5"): []
+    }
     with pytest.raises(JudgeError, match="bowl: Permission denied"):
         judged_files([tmp_path / "top"])
 

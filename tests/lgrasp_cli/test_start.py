@@ -142,7 +142,7 @@ import mujoco
 def test_names_that_the_terminal_cannot_show_are_no_failure(tmp_path):
     """Bytes of another encoding come out as they are; characters that another encoding lacks, escaped."""
     for name, encoding, shown in (
-        (b"bad\xff", "utf-8:strict", b"bad\xff"),
+        (b"bad\xff", "utf8:strict", b"bad\xff"),
         ("日".encode(), "latin-1:strict", b"\\u65e5"),
     ):
         given = os.fsencode(tmp_path) + b"/" + name
