@@ -140,7 +140,7 @@ def _object_key(path: Path, content: str, scale: float, params: ObjectParams) ->
 class Loader:
     """Hands, objects and fields from the cache, or made and cached; ``report`` is called with (what, share done).
 
-    All are made on the CPU, whatever the device of the job: rows do not depend on where they were made.
+    All are made on the CPU, whatever the device of the job, so that rows do not depend on it.
     """
 
     def __init__(self, cache: Cache, report: Report | None = None) -> None:

@@ -24,7 +24,7 @@ def preprocess_object(
     scale: float = 1.0,
     params: ObjectParams | None = None,
 ) -> ObjectModel:
-    """Mesh to ObjectModel; the same input gives the same bytes.
+    """Mesh to ObjectModel; the same input gives the same bytes on one kind of CPU.
 
     Args:
         scale: Factor from the file's unit to metres.
