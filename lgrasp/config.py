@@ -4,6 +4,7 @@ import copy
 import difflib
 import functools
 import math
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -161,7 +162,7 @@ def find_yaml(name: str, files: Mapping[str, Path], what: str) -> Path:
         ConfigError: neither.
     """
     path = files.get(name) or user_path(name)
-    if not path.is_file():
+    if not os.path.isfile(path):
         hint, known = did_you_mean(path.stem, files), ", ".join(files) or "none"
         raise ConfigError(f"unknown {what} '{name}'; {hint}known: {known}, or give the path of a YAML file")
     return path

@@ -47,10 +47,10 @@ def user_dir(kind: str) -> Path:
 
 def _home(find: Callable[[str], str], variable: str) -> Path:
     """A folder in the user's home."""
-    try:
-        return Path(find("lgrasp"))
-    except RuntimeError:
-        raise ConfigError(f"this user has no home folder; set HOME or {variable} to a whole path") from None
+    with suppress(RuntimeError):
+        if (folder := Path(find("lgrasp"))).is_absolute():
+            return folder
+    raise ConfigError(f"this user has no home folder; set HOME or {variable} to an absolute path")
 
 
 def pip_line(distribution: str) -> str:

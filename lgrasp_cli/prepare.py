@@ -44,7 +44,7 @@ def build_field(
     Example: lgrasp build-field allegro
     """
     if device is not None:
-        notice("--device is of no use: fields are built on the CPU; the option works in this release only")
+        notice("--device has no effect: fields are built on the CPU; the option works in this release only")
     cache = open_cache(cache_dir, fresh=rebuild)
     params = choose_pipeline(pipeline, settings=[f"field.index={index}"] if index else None).field
     from lgrasp.jobs.prepare import prepare_field

@@ -102,7 +102,7 @@ def walk(
 
     def is_new(folder: Path) -> bool:
         target = folder.resolve()
-        return not folder.is_symlink() or not (target.is_relative_to(real) or real.is_relative_to(target))
+        return not os.path.islink(folder) or not (target.is_relative_to(real) or real.is_relative_to(target))
 
     for name, below, files in os.walk(top, onerror=unread or _left_out, followlinks=True):
         here = Path(name)

@@ -156,27 +156,27 @@ class Cache:
 
     def prune(self, kinds: set[str] | None = None, older_than: float | None = None) -> tuple[int, int]:
         """Remove artifacts (of some kinds, last written before a time [s since 1970]); returns (files, bytes)."""
-        files = size = 0
-        kept: list[str] = []
-        for entry in self.entries():
-            if (kinds is None or entry.kind in kinds) and (older_than is None or entry.modified < older_than):
-                try:
-                    entry.path.unlink(missing_ok=True)
-                except OSError as error:
-                    kept.append(f"{entry.path}: {error.strerror}")
-                else:
-                    files, size = files + 1, size + entry.size
-        for folder in (self.root / "variants").glob("*/") if kinds is None else ():
-            if older_than is None or folder.stat().st_mtime < older_than:
-                found = [path for path in folder.rglob("*") if path.is_file()]
-                files, size = files + len(found), size + sum(path.stat().st_size for path in found)
-                shutil.rmtree(folder, ignore_errors=True)
+        old = [e for e in self.entries() if older_than is None or e.modified < older_than]
+        found = [(entry.path, entry.size) for entry in old if kinds is None or entry.kind in kinds]
+        variants = [*(self.root / "variants").glob("*/")] if kinds is None else []
+        variants = [folder for folder in variants if older_than is None or folder.stat().st_mtime < older_than]
+        inside = (path for folder in variants for path in folder.rglob("*") if path.is_file())
+        found += [(path, path.stat().st_size) for path in inside]
+        gone, kept = [], []
+        for path, size in found:
+            try:
+                path.unlink(missing_ok=True)
+                gone.append(size)
+            except OSError as error:
+                kept.append(f"{path}: {error.strerror}")
+        for folder in variants:
+            shutil.rmtree(folder, ignore_errors=True)
         remove_leftovers(self.root, "*/*.tmp")
         for folder in (self.root / "kernels").glob("*/"):
             remove_unfinished(folder)
         if kept:
             self.warn(f"{len(kept):,} that this user cannot remove stay, first {kept[0]}")
-        return files, size
+        return len(gone), sum(gone)
 
     def kernel_bytes(self) -> int:
         """Size of the compiled kernels, which Warp keeps in a folder of this one."""

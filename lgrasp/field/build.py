@@ -79,6 +79,7 @@ def build_field(
     """
     parts, groups = [], model.groups
     hand = upload_hand(model, "cpu", thumb)
+    wp.load_module(contact_vectors.module.name, "cpu")  # once, not by every thread
     slots = model.surfaces * len(model.tree.settings) * groups
     for slot, part in in_order(partial(_sample_slot, hand, params), range(slots), cores()):
         parts.append(part)
@@ -160,7 +161,7 @@ def _check_clear(model: HandModel, clear: np.ndarray) -> None:
 
 def _sample_slot(hand: HandArrays, params: FieldParams, slot: int) -> dict[str, np.ndarray]:
     """Contact vectors of a group in a setting; none when it has no contact surface, or no posture is clear."""
-    model, device = hand.model, "cpu"
+    model = hand.model
     settings = len(model.tree.settings)
     setting, group = divmod(slot, model.groups)
     # vectors may fill half of the memory bound, the table the rest
@@ -169,18 +170,18 @@ def _sample_slot(hand: HandArrays, params: FieldParams, slot: int) -> dict[str, 
     run = model.contact_run(setting // settings, group)
     touches = model.contact_first[run + 1] > model.contact_first[run]
     postures = max(1000, int(1.5 * records / _PER_POSTURE)) if touches else 0
-    posture = wp.zeros((postures, int(np.diff(model.tree.dof_first).max())), dtype=wp.uint8, device=device)
-    clear = wp.empty(postures, dtype=wp.int32, device=device)
+    posture = wp.zeros((postures, int(np.diff(model.tree.dof_first).max())), dtype=wp.uint8, device="cpu")
+    clear = wp.empty(postures, dtype=wp.int32, device="cpu")
     seed = params.seed * 1009 + slot % (settings * model.groups)  # every surface meets the same postures
     inputs = [hand.struct, group, setting, seed, _CLEARANCE]
-    wp.launch(sample_postures, postures, inputs, [posture, clear], device=device)
+    wp.launch(sample_postures, postures, inputs, [posture, clear], device="cpu")
     good = np.flatnonzero(to_numpy(clear))
     count = min(records, room) if len(good) else 0
     chosen = np.resize(np.repeat(good, _PER_POSTURE), count).astype(np.int32)
-    vectors = empty_struct(Vectors, device, count)
-    indices = wp.array(chosen, dtype=wp.int32, device=device)
+    vectors = empty_struct(Vectors, "cpu", count)
+    indices = wp.array(chosen, dtype=wp.int32, device="cpu")
     inputs = [hand.struct, group, setting, seed + 500_009, posture, indices]
-    wp.launch(contact_vectors, count, inputs, [vectors], device=device)
+    wp.launch(contact_vectors, count, inputs, [vectors], device="cpu")
     return {
         **{name: to_numpy(getattr(vectors, name)) for name in Vectors.vars},
         "posture": to_numpy(posture)[chosen],

@@ -58,7 +58,7 @@ def pieces_touch(model: HandModel, q: np.ndarray, pairs: np.ndarray, margin: flo
 
 
 def placed_pieces_touch(pieces: Pieces, pose: np.ndarray, pairs: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """As :func:`pieces_touch`, of pieces on the device, with their bodies at device poses (N, B, 7)."""
+    """As :func:`pieces_touch`, of pieces on the CPU, with their bodies at device poses (N, B, 7)."""
     start()
     out = wp.zeros((len(pose), len(pairs)), dtype=wp.int32, device="cpu")
     inputs = [

@@ -3,6 +3,7 @@ trusted. Light to import; cards are read without torch."""
 
 import io
 import json
+import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -36,7 +37,7 @@ def find_network(name: str) -> Path:
         ConfigError: neither.
     """
     path, known = user_path(name), known_networks()
-    if path.is_file():
+    if os.path.isfile(path):
         return path
     if name not in known:
         hint = did_you_mean(name, known)

@@ -27,7 +27,6 @@ from lgrasp.jobs.sequence.sample import SampleJob
 from lgrasp.learn.diffuser.file import load_diffuser
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.object.surface import sample_surface
-from lgrasp.runtime.device import resolve_device
 from lgrasp.runtime.fetch import fetch
 from lgrasp.runtime.tally import Meter
 from lgrasp.sequence.touching_sets import touching_sets
@@ -68,7 +67,7 @@ def network(shards, cache, tmp_path_factory):
 
 
 def test_steps_are_those_of_the_rows(shards, cache, inputs):
-    found = read_steps([shards], cache, resolve_device("cpu"), 64)
+    found = read_steps([shards], cache, 64)
     (path,) = shards.glob("*.h5")
     rows = read_shard(path).grasps
     steps, there = found.steps, rows.object_index[:, 1] >= 0

@@ -33,7 +33,7 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, start = self.params, time.perf_counter()
-        found = read_steps(self.shards, self.cache, self.device_used, p.cloud)
+        found = read_steps(self.shards, self.cache, p.cloud)
         check_hand(found.hand, self.hand, "the sequences")
         unseen = self.hold_out(found.meshes, found.steps, "steps", _MIN_STEPS)
         hand, net = found.hand, make_net(found.hand, len(found.space_names), p)
@@ -64,7 +64,7 @@ def evaluate(
     """
     net, about = load_diffuser(path)
     used, p = resolve_device(device), about.params
-    found = read_steps(shards, cache, used, p.cloud)
+    found = read_steps(shards, cache, p.cloud)
     digest = found.hand.sha256 if found.space_names == about.space_names else ""
     check_network_hand(path, about.hand, about.hand_sha256, found.hand.name, digest, words=SHARDS)
     net = net.to(used.alias).eval()

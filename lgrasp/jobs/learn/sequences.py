@@ -21,7 +21,6 @@ from lgrasp.learn.diffuser.examples import SequenceSteps
 from lgrasp.learn.diffuser.features import mesh_centre, surface_cloud
 from lgrasp.learn.diffuser.senses import coarse_grid
 from lgrasp.object.sdf import SdfGrid
-from lgrasp.runtime.device import Device
 
 _COLUMNS = ("q", "object_pose", "object_index", "sequence/space", "sequence/free_joints")
 
@@ -48,7 +47,7 @@ class _Part(NamedTuple):
     columns: Mapping[str, np.ndarray]
 
 
-def read_steps(paths: Paths, cache: Cache, device: Device, cloud: int) -> ReadSteps:
+def read_steps(paths: Paths, cache: Cache, cloud: int) -> ReadSteps:
     """The last step of every row of shards of sequences, which hold the rows of the steps before.
 
     Args:

@@ -84,7 +84,7 @@ class SampleJob(SampleRequest, SequenceJob):
     def with_sampler(self, inputs: SequenceInputs) -> SequenceInputs:
         net, about, _ = self.network
         models, alias = [obj.model for obj in inputs.objects], inputs.device.alias
-        clouds, grids = zip(*(_seen(model, about.params.cloud, alias) for model in models), strict=True)
+        clouds, grids = zip(*(_seen(model, about.params.cloud) for model in models), strict=True)
         sampler = StepSampler(inputs.hand.tree, net, about.params.process, clouds, grids, alias)
         return replace(inputs, sampler=sampler)
 
@@ -111,7 +111,7 @@ class SampleJob(SampleRequest, SequenceJob):
         return hand, [cloud_record(record, self._clouds[key[record.id]]) for record in records]
 
 
-def _seen(model: ObjectModel, count: int, device: str) -> tuple[np.ndarray, SdfGrid]:
+def _seen(model: ObjectModel, count: int) -> tuple[np.ndarray, SdfGrid]:
     """What a network sees of an object: points of its surface, and distances."""
     if not len(model.faces):
         drawn = np.random.default_rng(0).choice(len(model.obstacle_points), count)
