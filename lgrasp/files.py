@@ -2,7 +2,6 @@
 
 import atexit
 import errno
-import fcntl
 import glob
 import hashlib
 import os

@@ -40,7 +40,7 @@ def kill(what: str, path: Path) -> Path:
     """What is left of a path by a process that was killed while it made it."""
     done = subprocess.run([sys.executable, "-c", KILLED, what, str(path)], timeout=60, check=False)
     assert done.returncode == -signal.SIGKILL
-    (left,) = (p for p in path.parent.glob("*.tmp") if p.name.startswith(path.stem[:9]))
+    (left,) = (p for p in path.parent.glob("*.tmp") if path.stem.startswith(p.name.partition(".")[0]))
     return left
 
 

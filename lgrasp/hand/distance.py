@@ -53,7 +53,6 @@ def signed_distance(mesh: trimesh.Trimesh, points: np.ndarray, *, winding: bool 
     )
     out = wp.empty(len(points), dtype=wp.float32, device="cpu")
     queries = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device="cpu")
-
     wp.load_module(__name__, "cpu")  # once, not by every thread
 
     def measure(rows: slice) -> None:

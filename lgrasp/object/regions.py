@@ -83,13 +83,8 @@ def _locate(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tupl
     face, inside = (wp.empty(len(points), dtype=wp.int32, device="cpu") for _ in range(2))
     foot = wp.empty(len(points), dtype=wp.vec3, device="cpu")
     reach = 10.0 * float(np.ptp(np.vstack([vertices[np.unique(faces)], points]), axis=0).max())
-    wp.launch(
-        locate_points,
-        len(points),
-        [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach],
-        [face, foot, inside],
-        device="cpu",
-    )
+    inputs = [mesh.id, wp.array(points, dtype=wp.vec3, device="cpu"), reach]
+    wp.launch(locate_points, len(points), inputs, [face, foot, inside], device="cpu")
     return to_numpy(face), to_numpy(foot).astype(float), to_numpy(inside) == 1
 
 

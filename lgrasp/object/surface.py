@@ -118,13 +118,8 @@ def opposite_points(points: np.ndarray, normals: np.ndarray, *, seed: int) -> np
         Indices, shape (n,), int32; -1 where there is none.
     """
     out = wp.empty(len(points), dtype=wp.int32, device="cpu")
-    inputs = [
-        wp.array(points, dtype=wp.vec3, device="cpu"),
-        wp.array(normals, dtype=wp.vec3, device="cpu"),
-        _OPPOSED,
-        seed,
-    ]
-    wp.launch(kernels.draw_opposite, len(points), inputs, [out], device="cpu")
+    surface = [wp.array(values, dtype=wp.vec3, device="cpu") for values in (points, normals)]
+    wp.launch(kernels.draw_opposite, len(points), [*surface, _OPPOSED, seed], [out], device="cpu")
     return to_numpy(out)
 
 

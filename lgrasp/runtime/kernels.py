@@ -46,16 +46,17 @@ def first_time(device: str) -> str:
     return "compiling kernels once for this machine (30 to 60 s on two cores)"
 
 
-PREPARING = ("field.kernels", "hand.arrays", "hand.distance", "hand.pairs", "object.kernels")
+PREPARING = [
+    f"lgrasp.{name}" for name in ("field.kernels", "hand.arrays", "hand.distance", "hand.pairs", "object.kernels")
+]
 """Modules whose kernels make hands, objects and fields."""
 
 
 def load_preparing(progress: Callable[[str, float], None] | None = None) -> None:
     """Compile and load :data:`PREPARING`, side by side; the CPU runs them."""
-    names = [f"lgrasp.{name}" for name in PREPARING]
-    for name in names:
+    for name in PREPARING:
         importlib.import_module(name)
-    load_kernels("cpu", names, progress)
+    load_kernels("cpu", PREPARING, progress)
 
 
 def load_kernels(device: str, modules: list[str], progress: Callable[[str, float], None] | None = None) -> None:
