@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnContext, SpawnProcess
 from types import ModuleType, TracebackType
 from typing import Any, Self, TypeVar, cast
 
@@ -112,6 +113,17 @@ class Crew:
         return found
 
 
+class _SparedProcess(SpawnProcess):
+    """One that does not get the signal by which an executor ends the others where one was killed."""
+
+    def terminate(self) -> None:
+        self.kill()
+
+
+class _SparingContext(SpawnContext):
+    Process = _SparedProcess
+
+
 class ProcessPool(ProcessPoolExecutor):
     """Processes for calls of functions of modules, while the block runs.
 
@@ -121,7 +133,7 @@ class ProcessPool(ProcessPoolExecutor):
     def __init__(self, workers: int) -> None:
         start_tracker()
         self._workers = workers
-        super().__init__(workers, multiprocessing.get_context("spawn"), follow_parent)
+        super().__init__(workers, _SparingContext(), follow_parent)
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         with spared(), _no_main():  # it starts processes

@@ -6,11 +6,11 @@ import sys
 import time
 
 import pytest
-from support.workers import leave
+from support.workers import leave, lost
 
 from lgrasp.errors import DeviceError
 from lgrasp.runtime.kept import Keeper
-from lgrasp.runtime.processes import Crew, ProcessPool
+from lgrasp.runtime.processes import Crew, ProcessPool, none_killed
 
 
 def test_a_process_that_is_lost_ends_the_others():
@@ -37,6 +37,18 @@ def test_a_pool_that_is_kept_ends_when_all_is_forgotten():
     kept.close()
     with pytest.raises(RuntimeError, match="shutdown"):
         pool.submit(abs, -2)
+    assert multiprocessing.active_children() == []
+
+
+def test_a_pool_ends_where_one_of_its_processes_was_killed():
+    """At once, whatever the others do; an executor asks them to end by a signal that they are spared."""
+    begun = time.monotonic()
+    with ProcessPool(3) as pool:
+        assert list(pool.map(abs, range(-8, 0)))
+        pool.submit(time.sleep, 60)
+        with pytest.raises(DeviceError, match="a process that works was killed"), none_killed("works"):
+            pool.submit(lost).result()
+    assert time.monotonic() - begun < 30
     assert multiprocessing.active_children() == []
 
 
