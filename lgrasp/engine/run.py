@@ -203,6 +203,9 @@ class Job(Request, ABC):
         """A copy with other fields; nothing is loaded in it."""
         return type(self)(**self.values() | changes)
 
+    def begin(self) -> None:
+        """Start what helps this process make parts, before their inputs are loaded; called if there are any to make."""
+
     def close(self) -> None:
         """Release what was opened for the parts; called however the job ends."""
 
@@ -244,6 +247,8 @@ def run(
     absent = [part for part in parts if not os.path.lexists(part.file)]
     job.clean(parts)
     with closing(job):
+        if len(present) < len(parts):
+            job.begin()
         outcome = JobOutcome(job, device, parts, present, seconds={"kernels": prepare(job, todo)})
         if resume and absent:  # another run may have made files in the meantime
             job.present(absent)

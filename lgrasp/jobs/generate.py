@@ -98,11 +98,10 @@ class GenerateJob(GenerateRequest, SearchJob):
     def gave_up(self, rows: int, found: Found) -> bool:
         return gave_up(self.pipeline, rows, found.rows, found.tried)
 
-    def load(self, events: Events, missing: bool) -> None:
-        if missing and self.writers() > 1:
+    def begin(self) -> None:
+        if self.writers() > 1:
             self._writers = self.cache.kept.get("writers", self.writers(), partial(ProcessPool, self.writers()))
             self._writers.start(write_shard.__module__)
-        super().load(events, missing)
 
     def load_inputs(self, events: Events) -> Inputs:
         pipeline, device, self._rate = self.pipeline, self.device_used, self.rate
