@@ -137,6 +137,7 @@ class GenerateJob(GenerateRequest, SearchJob):
                 self._writers.submit(write_shard, part.file, contents).result()
             except BrokenExecutor:
                 self.cache.kept.forget("writers")
+                self.clean([part])
                 raise
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ import multiprocessing
 import numpy as np
 import pytest
 from support.jobs import StopAfter
-from support.workers import lost
+from support.workers import lost_halfway
 
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.engine.report import job_report
@@ -53,7 +53,7 @@ def test_stopped_it_leaves_whole_shards(plain, side_by_side, job, raw_grasps, tm
 
 
 def test_a_writer_that_is_lost_ends_the_job_with_a_line(side_by_side, run, tmp_path, monkeypatch):
-    monkeypatch.setattr("lgrasp.jobs.generate.write_shard", lost)
+    monkeypatch.setattr("lgrasp.jobs.generate.write_shard", lost_halfway)
     with pytest.raises(DeviceError, match=r"a process that writes .*allegro-mug-00000\.h5 was killed"):
         run()
     assert not [*(tmp_path / "out").rglob("*.h5*")]

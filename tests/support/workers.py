@@ -2,7 +2,9 @@
 
 import os
 import time
+from pathlib import Path
 
+from lgrasp.files import hold_file
 from lgrasp.runtime.processes import Link
 
 
@@ -16,4 +18,10 @@ def leave(link: Link, code: int) -> None:
 
 def lost(*work: object) -> None:
     """End without a word."""
+    os._exit(9)
+
+
+def lost_halfway(file: Path, *contents: object) -> None:
+    """End without a word while a file is being written."""
+    hold_file(file)
     os._exit(9)
