@@ -1,6 +1,6 @@
 """The shards that a command works on: files that were named, and those in folders that it can use."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -83,20 +83,21 @@ def gather(
 
 
 def sound_files(
-    paths: Paths, read: Callable[[Path], T], *, leave_out: Path | None = None
+    paths: Paths, read: Callable[[Path], T], *, leave_out: Path | None = None, named: Sequence[Path] | None = None
 ) -> list[tuple[Path, Path, T]]:
     """Files as of :func:`lgrasp.dataset.files.shards_below`, each with what was read of it; those in folders that
     cannot be used are left out, and reported in one line.
 
     Args:
         read: Raises ShardError where the file cannot be used.
+        named: Files that were named rather than found in a folder; by default those among ``paths``.
 
     Raises:
         ShardError: As of :func:`gather`.
     """
     found: list[tuple[Path, Path, T]] = []
     unusable: list[str] = []
-    by_name = set(named_files(paths))
+    by_name = set(named_files(paths) if named is None else named)
     for path, folder in shards_below(paths, leave_out):
         try:
             found.append((path, folder, read(path)))

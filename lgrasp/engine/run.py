@@ -74,6 +74,15 @@ class Job(Request, ABC):
             LgraspError: an option is out of range, or an input is not found.
         """
 
+    def whole(self, parts: list[Part]) -> list[Part]:
+        """Those of some parts whose inputs can be read to their end; this may take long, and is asked of the parts of
+        one task only.
+
+        Raises:
+            LgraspError: an input that was named cannot.
+        """
+        return parts
+
     def warm(self) -> None:
         """Have libraries load what their first call would, once the inputs are loaded and while kernels are."""
 
@@ -316,7 +325,9 @@ def look(job: Job, *, array: Array | tuple[int, int], resume: bool) -> Todo:
     if array.tasks > 1:
         job.events.said(array.words([part.number for part in parts], job.part))
     check_folder(job.folder)
-    return Todo(array, job.device_used, every, parts, job.present(parts) if resume else {})
+    whole = job.whole(parts)
+    every = [part for part in every if part in whole or part not in parts] if len(whole) < len(parts) else every
+    return Todo(array, job.device_used, every, whole, job.present(whole) if resume else {})
 
 
 def own_parts(job: Job, array: Array) -> tuple[Array, list[Part], list[Part]]:

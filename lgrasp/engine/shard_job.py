@@ -11,7 +11,8 @@ import numpy as np
 from pydantic import PrivateAttr
 
 from lgrasp.dataset.extend import extend_shard
-from lgrasp.dataset.gather import gather
+from lgrasp.dataset.files import named_files
+from lgrasp.dataset.gather import gather, sound_files
 from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
@@ -58,8 +59,17 @@ class ShardJob(ShardRequest, Job):
         return parts
 
     def check_source(self, reader: ShardReader) -> None:
-        """Raise ShardError if a shard is damaged, or none for this job; among others in a folder it is left out."""
-        reader.check_whole()
+        """Raise ShardError if a shard is none for this job; among others in a folder it is left out."""
+
+    def whole(self, parts: list[Part]) -> list[Part]:
+        def check(path: Path) -> None:
+            with ShardReader(path) as reader:
+                reader.check_whole()
+
+        sources = [part.source for part in parts if part.source]
+        found = sound_files(sources, check, named=named_files(self.shards)) if sources else []
+        sound = {path for path, *_ in found}
+        return [part for part in parts if part.source in sound]
 
     def about(self) -> dict[str, Any]:
         return {"hand": ", ".join(sorted(self._hands)), "objects": sorted(self._objects)}

@@ -43,7 +43,6 @@ class MetricsJob(MetricsRequest, ShardJob):
         return content_key("metrics", 1, names=list(self.add), settings=list(self.settings))
 
     def check_source(self, reader: ShardReader) -> None:
-        super().check_source(reader)
         if HOLD not in self.add:
             return
         names = reader.object_ids

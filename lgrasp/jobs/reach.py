@@ -56,7 +56,6 @@ class ReachJob(ReachRequest, VerdictJob):
         return super().parts()
 
     def check_source(self, reader: ShardReader) -> None:
-        super().check_source(reader)
         if reader.columns["object_index"][0][1] != 1:
             raise ShardError(f"{reader.path}: rows of several objects cannot be placed; one object a row is accepted")
 

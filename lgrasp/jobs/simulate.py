@@ -71,7 +71,6 @@ class SimulateJob(SimulateRequest, VerdictJob):
         return found | {"all_directions": bool(found.get("all_directions")) and self._all}
 
     def check_source(self, reader: ShardReader) -> None:
-        super().check_source(reader)
         steered = reader.header.config.get("steered")
         if self.protocol.table and isinstance(steered, dict) and "above" in steered:
             raise ShardError(f"{reader.path}: {NO_TABLE}")

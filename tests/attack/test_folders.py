@@ -9,13 +9,17 @@ import pytest
 from support.jaws import jaw_rows, jaw_shard
 
 from lgrasp.dataset.files import check_heaps, sha256
+from lgrasp.dataset.manifest import read_manifest
 from lgrasp.dataset.reader import open_hdf5
 from lgrasp.dataset.scenes import SceneRows
 from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.engine.events import JobOutcome
+from lgrasp.engine.run import run as run_job
 from lgrasp.errors import HandError, ShardError
 from lgrasp.hand.urdf import read_robot
+from lgrasp.jobs.metrics import MetricsJob
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.run import judge
 
@@ -53,6 +57,21 @@ def test_what_is_damaged_is_not_drawn(folder, said):
             rows.sound(asked)
     with pytest.raises(ShardError, match=r"2\.h5: "):  # it was named
         SceneRows([folder / "0.h5", folder / "2.h5"])
+
+
+def test_tasks_of_an_array_read_the_rows_of_their_own_shards(folder, said, cache_root, tmp_path):
+    def task(number: int, tasks: int) -> JobOutcome:
+        given = {"add": ("volume",), "out": tmp_path / f"{tasks}", "device": "cpu", "cache": Cache(cache_root)}
+        return run_job(MetricsJob(shards=(folder,), **given), array=(number, tasks))
+
+    assert [path.name for path in task(0, 2).paths] == ["0.h5"]
+    with pytest.raises(ShardError, match=r"1\.h5: .*damaged"):
+        task(1, 2)
+    assert {line.partition(": ")[0] for line in said} == {f"2 of 4 files are left out, first {folder / '2.h5'}"}
+    said.clear()
+    assert [path.name for path in task(0, 1).paths] == ["0.h5"]
+    assert said[-1].startswith(f"1 of 2 files are left out, first {folder / '1.h5'}: ")
+    assert [shard.file for shard in read_manifest(tmp_path / "1" / "manifest.json").shards] == ["0.h5"]
 
 
 def test_a_shard_in_the_place_of_another(run, raw_grasps, cache_root, tmp_path):

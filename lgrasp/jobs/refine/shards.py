@@ -68,13 +68,15 @@ class RefineJob(RefineRequest, ShardJob):
         return parts
 
     def check_source(self, reader: ShardReader) -> None:
-        super().check_source(reader)
         if reader.header.config.get(SURROUNDED):
             notice(f"{reader.path}: planned beside other things, of which the shard has none: hands may move into them")
         if reader.space_names is not None or len(reader.object_ids) != 1 or reader.columns["object_index"][0][1] != 1:
             raise ShardError(
                 f"{reader.path}: rows of several objects cannot be refined; one object to a shard is accepted"
             )
+
+    def whole(self, parts: list[Part]) -> list[Part]:
+        return super().whole(parts) if self.form is None else parts
 
     def _parts_of_export(self, form: str) -> list[Part]:
         """Grasps in the format of another program: a part of each object and scale, those of one name numbered."""
