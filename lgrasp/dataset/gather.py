@@ -83,7 +83,12 @@ def gather(
 
 
 def sound_files(
-    paths: Paths, read: Callable[[Path], T], *, leave_out: Path | None = None, named: Sequence[Path] | None = None
+    paths: Paths,
+    read: Callable[[Path], T],
+    *,
+    leave_out: Path | None = None,
+    named: Sequence[Path] | None = None,
+    some: bool = True,
 ) -> list[tuple[Path, Path, T]]:
     """Files as of :func:`lgrasp.dataset.files.shards_below`, each with what was read of it; those in folders that
     cannot be used are left out, and reported in one line.
@@ -91,6 +96,7 @@ def sound_files(
     Args:
         read: Raises ShardError where the file cannot be used.
         named: Files that were named rather than found in a folder; by default those among ``paths``.
+        some: At least one must be left.
 
     Raises:
         ShardError: As of :func:`gather`.
@@ -105,7 +111,7 @@ def sound_files(
             if path in by_name:
                 raise
             unusable.append(str(error))
-    if not found:
+    if some and not found:
         raise ShardError(unusable[0])
     if unusable:
         notice(f"{len(unusable)} of {len(unusable) + len(found)} files are left out, first {unusable[0]}")

@@ -74,12 +74,12 @@ class Job(Request, ABC):
             LgraspError: an option is out of range, or an input is not found.
         """
 
-    def whole(self, parts: list[Part]) -> list[Part]:
+    def whole(self, parts: list[Part], *, some: bool) -> list[Part]:
         """Those of some parts whose inputs can be read to their end; this may take long, and is asked of the parts of
         one task only.
 
         Raises:
-            LgraspError: an input that was named cannot.
+            LgraspError: an input that was named cannot, or, if there must be ``some``, none can.
         """
         return parts
 
@@ -325,7 +325,7 @@ def look(job: Job, *, array: Array | tuple[int, int], resume: bool) -> Todo:
     if array.tasks > 1:
         job.events.said(array.words([part.number for part in parts], job.part))
     check_folder(job.folder)
-    whole = job.whole(parts)
+    whole = job.whole(parts, some=array.lanes == 1)
     every = [part for part in every if part in whole or part not in parts] if len(whole) < len(parts) else every
     return Todo(array, job.device_used, every, whole, job.present(whole) if resume else {})
 

@@ -61,14 +61,15 @@ class ShardJob(ShardRequest, Job):
     def check_source(self, reader: ShardReader) -> None:
         """Raise ShardError if a shard is none for this job; among others in a folder it is left out."""
 
-    def whole(self, parts: list[Part]) -> list[Part]:
+    def whole(self, parts: list[Part], *, some: bool) -> list[Part]:
         def check(path: Path) -> None:
             with ShardReader(path) as reader:
                 reader.check_whole()
 
+        if not parts:
+            return []
         sources = [part.source for part in parts if part.source]
-        found = sound_files(sources, check, named=named_files(self.shards)) if sources else []
-        sound = {path for path, *_ in found}
+        sound = {path for path, *_ in sound_files(sources, check, named=named_files(self.shards), some=some)}
         return [part for part in parts if part.source in sound]
 
     def about(self) -> dict[str, Any]:

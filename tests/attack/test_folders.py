@@ -22,6 +22,7 @@ from lgrasp.hand.urdf import read_robot
 from lgrasp.jobs.metrics import MetricsJob
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.run import judge
+from lgrasp.runtime.array import Array
 
 
 @pytest.fixture
@@ -60,13 +61,15 @@ def test_what_is_damaged_is_not_drawn(folder, said):
 
 
 def test_tasks_of_an_array_read_the_rows_of_their_own_shards(folder, said, cache_root, tmp_path):
-    def task(number: int, tasks: int) -> JobOutcome:
+    def task(number: int, tasks: int, **lane: int) -> JobOutcome:
         given = {"add": ("volume",), "out": tmp_path / f"{tasks}", "device": "cpu", "cache": Cache(cache_root)}
-        return run_job(MetricsJob(shards=(folder,), **given), array=(number, tasks))
+        return run_job(MetricsJob(shards=(folder,), **given), array=Array(number, tasks, **lane))
 
     assert [path.name for path in task(0, 2).paths] == ["0.h5"]
     with pytest.raises(ShardError, match=r"1\.h5: .*damaged"):
         task(1, 2)
+    assert not task(1, 2, lanes=2).paths  # devices side by side: the others may have more
+    assert said.pop().startswith(f"1 of 1 files are left out, first {folder / '1.h5'}: ")
     assert {line.partition(": ")[0] for line in said} == {f"2 of 4 files are left out, first {folder / '2.h5'}"}
     said.clear()
     assert [path.name for path in task(0, 1).paths] == ["0.h5"]

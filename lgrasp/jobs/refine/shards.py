@@ -75,8 +75,8 @@ class RefineJob(RefineRequest, ShardJob):
                 f"{reader.path}: rows of several objects cannot be refined; one object to a shard is accepted"
             )
 
-    def whole(self, parts: list[Part]) -> list[Part]:
-        return super().whole(parts) if self.form is None else parts
+    def whole(self, parts: list[Part], *, some: bool) -> list[Part]:
+        return super().whole(parts, some=some) if self.form is None else parts
 
     def _parts_of_export(self, form: str) -> list[Part]:
         """Grasps in the format of another program: a part of each object and scale, those of one name numbered."""
