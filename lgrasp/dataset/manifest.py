@@ -195,6 +195,11 @@ def listed(shard: ListedShard, path: Path, rows: int) -> ListedShard:
     return shard.model_copy(update={"rows": rows, "bytes": path.stat().st_size, "sha256": digest})
 
 
+def is_as_listed(shard: ListedShard | None, path: Path) -> bool:
+    """Whether a file is the one of which an entry has the SHA-256, so that it is as it was written."""
+    return bool(shard and shard.sha256) and not _difference(shard, path, True)
+
+
 def read_manifest(path: str | os.PathLike[str]) -> Manifest | None:
     """The manifest in a file; None if there is no file, or an empty one, which is being made.
 

@@ -75,11 +75,10 @@ def found_shard(path: Path) -> Found:
     from lgrasp.grasp.schema import MADE_FROM
 
     check_heaps(path)
-    with ShardReader(path) as reader:
+    with ShardReader(path, invalid=False) as reader:
         config, statistics = reader.header.config, reader.statistics
         if MADE_FROM in statistics:
-            return Found(str(statistics[MADE_FROM]), len(reader))
-    with ShardReader(path, invalid=False) as reader:
+            return Found(str(statistics[MADE_FROM]), reader.columns["q"][0][0])
         # of a file with sequences only the whole ones count, and rounds are tried
         rows = int(statistics.get("sequences", len(reader)))
         tried = statistics.get("rounds" if "sequences" in statistics else "candidates", 0)

@@ -4,7 +4,7 @@ replaces what they are."""
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cached_property, partial
 from pathlib import Path
@@ -187,6 +187,12 @@ def _time(path: Path) -> int:
         return path.stat().st_mtime_ns
     except OSError:
         return 0
+
+
+def entries(files: Iterable[Path]) -> dict[Path, ListedShard]:
+    """What manifests say of files that lie in the folders of some."""
+    folders = {file.parent for file in files}
+    return {folder / shard.file: shard for folder in folders for shard in _manifest(folder).shards}
 
 
 def begun_array(parts: Sequence[Part]) -> str:
