@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -43,21 +44,24 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
         begun = map(_described, requests[len(results) : len(results) + 1])
         _report([*results, *(one | {"status": "interrupted", "error": "", "exit_code": 130} for one in begun)], how)
 
-    with how.spread(requests) as each, before_end(interrupted):
+    stopped = False
+    with closing(how.cache.kept), how.spread(requests) as each, before_end(interrupted):
         for number, (request, own) in enumerate(zip(requests, each, strict=True), 1):
             if not how.quiet:
                 typer.echo(f"[{number}/{len(each)}] {request.title}", err=True)
             how.cache.more_jobs = number < len(each)
-            results.append(_run_one(request, own))
-            if results[-1]["exit_code"] == 130:
+            result, stop = _run_one(request, own)
+            results.append(result)
+            if stop:
+                stopped = how.cache.more_jobs
                 break
-    if code := _report(results, how):
+    if code := _report(results, how, stopped=stopped):
         raise typer.Exit(code)
 
 
-def _report(results: list[dict[str, Any]], how: How) -> int:
-    """Show what came of jobs; the worst exit code."""
-    code = max(result["exit_code"] for result in results)
+def _report(results: list[dict[str, Any]], how: How, *, stopped: bool = False) -> int:
+    """Show what came of jobs; the worst exit code, or that of an interrupt if they were ``stopped``."""
+    code = max(130 * stopped, *(result["exit_code"] for result in results))
     columns = ("job", "what", "requested", "rows", "wall s", "strict/s", "status")
     table = TextTable(columns, map(_row, results), right=columns[2:6])
     print_report({"jobs": results, "exit_code": code}, how.json_path, () if how.quiet else [table])
@@ -88,28 +92,29 @@ def show_plans(requests: "Sequence[Request]", how: How) -> None:
         raise typer.Exit(code)
 
 
-def _run_one(request: "Request", how: How) -> dict[str, Any]:
-    """The report of a job with its status, one line of why, and exit code."""
+def _run_one(request: "Request", how: How) -> tuple[dict[str, Any], bool]:
+    """The report of a job with its status, one line of why, and exit code; and whether no other is to begin."""
     data = _described(request)
-    status, text, code = "done", "", 0
+    status, text, code, stop = "done", "", 0, False
     try:
         job = how.checked(request)
         from lgrasp.engine.run import own_parts  # not before the check
 
         if how.array.total and not own_parts(job, how.array)[-1]:
-            return data | {"status": "of other tasks", "error": text, "exit_code": code}
+            return data | {"status": "of other tasks", "error": text, "exit_code": code}, False
         found, outcome = run_job(job, how)
         data |= found
+        stop = outcome.stopped
         conclude(outcome, how)
     except typer.Exit:
-        status, code = "interrupted", 130
+        status, code, stop = "interrupted", 130, True
     except Exception as error:  # also what nobody expects: the others do not end by it
         line, code = explain(error)
         if not line:  # nobody reads
             raise
         status, text = "starved" if code == 3 else "failed", line.removeprefix("error: ")
         typer.echo(line, err=True)
-    return data | {"status": status, "error": text, "exit_code": code}
+    return data | {"status": status, "error": text, "exit_code": code}, stop
 
 
 def _row(result: dict[str, Any]) -> tuple[str, ...]:

@@ -241,6 +241,7 @@ def run_job(job: "Job", how: How) -> tuple[dict[str, Any], "JobOutcome"]:
 
     with Bar(quiet=how.quiet) as bar, interruptible(JobProgress(bar, job.unit)) as progress, before_end(job.abandon):
         outcome = (how.outcome or partial(run, array=how.array, resume=not how.overwrite))(job, progress)
+    outcome.stopped = progress.stop
     return job_report(outcome), outcome
 
 

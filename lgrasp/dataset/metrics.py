@@ -13,7 +13,7 @@ from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.records import GraspRows, ObjectRecord
 from lgrasp.grasp.wrench_space import wrench_spaces
 from lgrasp.object.mass import mass_properties
-from lgrasp.runtime.processes import ProcessPool, none_killed
+from lgrasp.runtime.processes import ProcessPool
 
 METRICS = {"epsilon_exact": "", "volume": ""}
 """Units of the metrics that can be added (docs/reference/metrics.md defines them)."""
@@ -116,5 +116,5 @@ def process_map(workers: int) -> Iterator[_Map]:
     if workers == 1:
         yield map
         return
-    with none_killed("computes metrics"), ProcessPool(workers) as pool:
+    with ProcessPool(workers) as pool:
         yield pool.map

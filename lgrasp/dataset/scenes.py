@@ -198,12 +198,18 @@ class SceneRows:
 
     def caption(self, row: int, among: Sequence[int]) -> str:
         """What tells a row from others: its number, and hand and objects where these differ."""
-        names = {}
-        for r in (row, *among):
-            hand, objects, rows = self.read(r)
-            names[r] = hand.name, " + ".join(objects[k].id for k in rows.object_index[0] if 0 <= k < len(objects))
-        differing = [k for k in (0, 1) if len({n[k] for n in names.values()}) > 1]
-        return " · ".join([*(names[row][k] for k in differing), f"row {row:,}"])
+        return self.captions((row, *among))[0]
+
+    def captions(self, chosen: Sequence[int]) -> list[str]:
+        """What tells some rows from each other."""
+        names = []
+        for row in chosen:
+            hand, objects, rows = self.read(row)
+            names.append((hand.name, " + ".join(objects[k].id for k in rows.object_index[0] if 0 <= k < len(objects))))
+        differing = [k for k in (0, 1) if len({name[k] for name in names}) > 1]
+        return [
+            " · ".join([*(name[k] for k in differing), f"row {row:,}"]) for row, name in zip(chosen, names, strict=True)
+        ]
 
 
 def draw_rows(rows: SceneRows, chosen: Sequence[int], *, stage: str = "grasp", **options: Any) -> "Image.Image":
@@ -252,7 +258,7 @@ def draw_motion(
             pictures.append(own)
             if progress:
                 progress(len(pictures), len(scenes))
-    captions = [rows.caption(row, chosen) for row in chosen]
+    captions = rows.captions(chosen)
     return [sheet(at, captions, columns) for at in zip(*pictures, strict=True)]
 
 

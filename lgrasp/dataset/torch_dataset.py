@@ -195,6 +195,7 @@ class GraspDataset(TorchRows, torch.utils.data.Dataset):
         super().__init__(paths, columns, negatives, split, part)
         self._cache_bytes = cache_bytes
         self._cache: OrderedDict[tuple[int, int], dict[str, torch.Tensor]] = OrderedDict()
+        self._held = 0  # bytes in it
 
     def __len__(self) -> int:
         return self._ends[-1]
@@ -218,7 +219,7 @@ class GraspDataset(TorchRows, torch.utils.data.Dataset):
         return items
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_cache": OrderedDict()}
+        return {**self.__dict__, "_cache": OrderedDict(), "_held": 0}
 
     def split(
         self, *, by: GroupName, shares: Sequence[float] = (0.8, 0.1, 0.1), seed: int = 0
@@ -262,10 +263,12 @@ class GraspDataset(TorchRows, torch.utils.data.Dataset):
         key = (shard, number)
         if key not in self._cache:
             self._cache[key] = self._read(shard, number * CHUNK_ROWS, (number + 1) * CHUNK_ROWS)
-            while len(self._cache) > 1 and self._held_bytes() > self._cache_bytes:
-                self._cache.popitem(last=False)
+            self._held += _bytes(self._cache[key])
+            while len(self._cache) > 1 and self._held > self._cache_bytes:
+                self._held -= _bytes(self._cache.popitem(last=False)[1])
         self._cache.move_to_end(key)
         return self._cache[key]
 
-    def _held_bytes(self) -> int:
-        return sum(values.nbytes for block in self._cache.values() for values in block.values())
+
+def _bytes(block: dict[str, torch.Tensor]) -> int:
+    return sum(values.nbytes for values in block.values())

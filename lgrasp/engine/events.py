@@ -62,6 +62,8 @@ class JobOutcome:
     """Of loading kernels, making parts and the whole call [s]."""
     starved: bool = False
     cancelled: bool = False
+    stopped: bool = False
+    """It was asked to stop, if only when all was made."""
     lanes: int = 1
     """Devices that made parts side by side."""
 

@@ -191,7 +191,8 @@ class Job(Request, ABC):
 
     def kept_rows(self, outcome: JobOutcome) -> int:
         """Rows of parts that are not done that the same job need not make again."""
-        missing = [part for part in outcome.parts if part.file not in outcome.paths]
+        there = set(outcome.paths)
+        missing = [part for part in outcome.parts if part.file not in there]
         return sum(self.kept_of(part) for part in missing[: outcome.lanes * self.at_once()])
 
     def kept_of(self, part: Part) -> int:

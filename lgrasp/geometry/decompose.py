@@ -18,7 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lgrasp.errors import DecomposeError
+from lgrasp.errors import DecomposeError, DeviceError
 from lgrasp.signals import spared
 
 DECOMPOSE_VERSION = 1
@@ -76,6 +76,7 @@ def decompose(
 
     Raises:
         DecomposeError: time-out, crash, or nothing usable came back.
+        DeviceError: the process was killed, or cannot be started.
     """
     vertices = np.ascontiguousarray(vertices, np.float64)
     faces = np.ascontiguousarray(faces, np.int32)
@@ -143,7 +144,9 @@ def _run(
     except subprocess.TimeoutExpired:
         raise _TimeOutError(timeout) from None
     except OSError as error:
-        raise DecomposeError(f"convex decomposition cannot be started: {error.strerror}") from None
+        raise DeviceError(f"the process that cuts meshes cannot be started: {error.strerror}") from None
+    if helper.returncode == -getattr(signal, "SIGKILL", 9):  # for memory, say: another machine has other pieces
+        raise DeviceError("the process that cuts meshes was killed; the same command goes on")
     try:
         with np.load(io.BytesIO(out), allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in ("vertices", "first")}

@@ -100,8 +100,15 @@ class GenerateJob(GenerateRequest, SearchJob):
 
     def begin(self) -> None:
         if self.writers() > 1:
-            self._writers = self.cache.kept.get("writers", self.writers(), partial(ProcessPool, self.writers()))
-            self._writers.start(write_shard.__module__)
+            try:
+                self._start_writers()
+            except BrokenExecutor:  # those of the job before, of which one was killed since
+                self.cache.kept.forget("writers")
+                self._start_writers()
+
+    def _start_writers(self) -> None:
+        self._writers = self.cache.kept.get("writers", self.writers(), partial(ProcessPool, self.writers()))
+        self._writers.start(write_shard.__module__)
 
     def load_inputs(self, events: Events) -> Inputs:
         pipeline, device, self._rate = self.pipeline, self.device_used, self.rate

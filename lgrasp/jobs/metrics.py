@@ -25,6 +25,7 @@ from lgrasp.jobs.shard_inputs import arrays_of_shard, object_of_shard
 from lgrasp.notices import notice
 from lgrasp.object.arrays import upload_object
 from lgrasp.runtime.cores import threads
+from lgrasp.runtime.processes import none_killed
 
 HOLD = "hold"
 
@@ -95,9 +96,11 @@ class MetricsJob(MetricsRequest, ShardJob):
         if others:
             if self._each is None:
                 self._each = self._open.enter_context(process_map(workers))
-            found = measure_shard(
-                part.source, bounds.friction, self._each, 4 * workers * TASK_ROWS, lambda done: progress(done // kinds)
-            )
+            block = 4 * workers * TASK_ROWS
+            with none_killed("computes metrics"):
+                found = measure_shard(
+                    part.source, bounds.friction, self._each, block, lambda done: progress(done // kinds)
+                )
             columns |= {name: found[name] for name in others}
         if HOLD in self.add:
             first = part.rows * (kinds - 1)

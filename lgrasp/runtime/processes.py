@@ -132,12 +132,19 @@ class ProcessPool(ProcessPoolExecutor):
 
     def __init__(self, workers: int) -> None:
         start_tracker()
-        self._workers = workers
+        self._workers, self._watched = workers, set[int]()
+        self._ending = threading.Lock()  # taken for good by what ends the pool
         super().__init__(workers, _SparingContext(), follow_parent)
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         with spared(), _no_main():  # it starts processes
-            return super().submit(fn, *args, **kwargs)
+            future = super().submit(fn, *args, **kwargs)
+        processes: Any = self._processes or {}
+        for number in processes.keys() - self._watched:
+            self._watched.add(number)
+            what = processes[number], processes, self._result_queue, self._ending
+            threading.Thread(target=_end_with, args=what, daemon=True).start()
+        return future
 
     def start(self, module: str) -> None:
         """Have every process start, and load what a module needs, before there is work."""
@@ -146,6 +153,7 @@ class ProcessPool(ProcessPoolExecutor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """As every executor's; with ``cancel_futures`` calls that have begun are cut off."""
+        self._ending.acquire(blocking=False)
         manager: Any = self._executor_manager_thread
         processes = list((self._processes or {}).values())
         super().shutdown(wait=False, cancel_futures=cancel_futures)
@@ -158,6 +166,16 @@ class ProcessPool(ProcessPoolExecutor):
         self, exc_type: type[BaseException] | None, exc_val: BaseException | None, exc_tb: TracebackType | None
     ) -> None:
         self.shutdown(cancel_futures=exc_type is not None)
+
+
+def _end_with(process: Any, processes: dict[int, Any], results: Any, once: threading.Lock) -> None:
+    """End a pool of which a process was killed. That may have left half a result in the pipe that all of them write to,
+    and the executor would wait for the other half for good."""
+    wait([process.sentinel])
+    if once.acquire(blocking=False):
+        for other in list(processes.values()):
+            other.kill()
+        results._writer.close()
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import sys
 import time
 
 import pytest
-from support.workers import leave, lost
+from support.workers import leave, lost, lost_in_a_result
 
 from lgrasp.errors import DeviceError
 from lgrasp.runtime.kept import Keeper
@@ -40,14 +40,15 @@ def test_a_pool_that_is_kept_ends_when_all_is_forgotten():
     assert multiprocessing.active_children() == []
 
 
-def test_a_pool_ends_where_one_of_its_processes_was_killed():
+@pytest.mark.parametrize("end", [lost, lost_in_a_result])
+def test_a_pool_ends_where_one_of_its_processes_was_killed(end):
     """At once, whatever the others do; an executor asks them to end by a signal that they are spared."""
     begun = time.monotonic()
     with ProcessPool(3) as pool:
         assert list(pool.map(abs, range(-8, 0)))
         pool.submit(time.sleep, 60)
         with pytest.raises(DeviceError, match="a process that works was killed"), none_killed("works"):
-            pool.submit(lost).result()
+            pool.submit(end).result()
     assert time.monotonic() - begun < 30
     assert multiprocessing.active_children() == []
 
