@@ -74,7 +74,7 @@ def merge(
     from lgrasp.dataset.merge import merge_shards
 
     rows = merge_shards(paths[0] if len(paths) == 1 else paths, out, manifest=manifest, partial=partial)
-    typer.echo(f"{out}: {rows} rows")
+    typer.echo(f"{out}: {rows:,} rows")
 
 
 app.command("split")(split_rows)

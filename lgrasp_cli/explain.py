@@ -1,5 +1,6 @@
 """A failure in one line for the user, with its exit code."""
 
+import errno
 import os
 import re
 import sys
@@ -25,8 +26,8 @@ def explain(error: BaseException) -> tuple[str, int]:
         return "", error.code if isinstance(error.code, int) else 1
     if is_out_of_memory(error):
         return "error: out of memory; lower --workers, or --batch or --shard-rows if the command has them", 2
-    if "can't start new thread" in str(error):
-        return "error: no more threads or processes are allowed here (ulimit -u, or a container's limit)", 2
+    if "can't start new thread" in str(error) or getattr(error, "errno", None) == errno.EAGAIN:
+        return "error: no more threads or processes are allowed here (ulimit -u or -v, or a container's limit)", 2
     if isinstance(error, FileNotFoundError) and not error.filename and not _has_folder():
         return "error: the current folder is not there any more; change to another one", 2
     if isinstance(error, OSError) and error.errno is not None:

@@ -160,8 +160,9 @@ class Job(Request, ABC):
 
     def replaced(self, every: Sequence[Part]) -> list[Path]:
         """Files of another run that has those of this one, beyond its last part."""
-        found, key = [], self.key()
-        for path in neighbours([part.file for part in every]) if self.one_key else ():
+        others, found = neighbours([part.file for part in every]) if self.one_key else [], []
+        key = self.key() if others else ""
+        for path in others:
             with suppress(ShardError, ValueError):
                 found += [path] if found_shard(path).key != key else []
         return found

@@ -195,7 +195,7 @@ class GenerateJob(GenerateRequest, SearchJob):
             ``grasps_per_s``, ``strict_valid_per_s``, ``published_count_per_s`` (over the wall time of placement through
             filter), ``seconds`` (thread-seconds per stage; ``wall`` of placement through filter; hand, object, field),
             ``survivors`` and ``counts`` per stage, ``near_duplicates`` (across shards), ``distinct_poses``,
-            ``force_closure`` (share), what was asked, ``negatives`` if they were, and of objects on a table
+            ``force_closure`` (share), ``negatives`` if they were, and of objects on a table
             ``resting``: ``probability`` and ``rows`` of each resting pose.
         """
         inputs = self.inputs
@@ -224,7 +224,6 @@ class GenerateJob(GenerateRequest, SearchJob):
             "profile": self.pipeline.bounds.told,
             **{f"{name}_per_s": made[of] / wall if wall else 0.0 for name, of in rates.items()},
             "survivors": survivors(sums["counts"]),
-            "asked": self.rows,
             "object": inputs.object.model.name,
             **({"resting": resting} if resting else {}),
             **sums,

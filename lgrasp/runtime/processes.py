@@ -223,7 +223,10 @@ def follow_parent() -> None:
         os._exit(1)
 
     if parent is not None:
-        threading.Thread(target=follow, daemon=True).start()
+        try:
+            threading.Thread(target=follow, daemon=True).start()
+        except RuntimeError:  # no more threads are allowed: the one that started this says so
+            os._exit(1)
 
 
 def start_tracker() -> None:

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from support.solids import ELL, YOU, prism
 
 from lgrasp.engine.cache import Cache
-from lgrasp.errors import DecomposeError
+from lgrasp.errors import DecomposeError, DeviceError
 from lgrasp.geometry import decompose as module
 from lgrasp.geometry.decompose import decompose
 
@@ -54,6 +54,17 @@ def test_time_out_and_crash_are_errors_of_ours():
         decompose(mesh.vertices, mesh.faces, timeout=0.01)
     with pytest.raises(DecomposeError, match="failed"):
         decompose(mesh.vertices, mesh.faces + 10_000_000, threshold=0.005)
+
+
+def test_a_process_that_is_killed_is_no_verdict_on_the_mesh():
+    """Another try may have memory; the convex hull must not stand for the mesh meanwhile."""
+    mesh = prism(ELL)
+
+    def kill(what: str) -> None:
+        subprocess.run(["pkill", "-9", "-P", str(os.getpid()), "-f", "lgrasp.geometry.decompose"])
+
+    with pytest.raises(DeviceError, match="was killed; the same command goes on"):
+        decompose(mesh.vertices, mesh.faces, threshold=0.0051, tell=kill)
 
 
 def test_results_are_kept(tmp_path, monkeypatch):

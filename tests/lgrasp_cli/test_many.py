@@ -114,6 +114,21 @@ def test_a_job_that_breaks_does_not_end_the_others(cli, quick, monkeypatch):
     assert "unexpected ValueError: what nobody expects" in made.err
 
 
+def test_a_signal_while_the_last_shard_is_written_ends_all_jobs(cli, quick, monkeypatch):
+    """The job is whole; no other begins."""
+
+    def asked(job, how):
+        report, outcome = run_job(job, how)
+        outcome.stopped = True
+        return report, outcome
+
+    monkeypatch.setattr("lgrasp_cli.many.run_job", asked)
+    objects = ("--object", "tiny", "--object", "sphere")
+    made = cli("generate", *objects, "-p", quick, "-n", 4, "--device", "cpu", "--json", "-")
+    data = json.loads(made.out)
+    assert (made.code, data["exit_code"], [job["status"] for job in data["jobs"]]) == (130, 130, ["done"])
+
+
 def test_a_process_ended_while_it_loads_reports_the_jobs_before(cli, quick, monkeypatch, tmp_path):
     def ended(job, how):
         if "sphere" in str(job.object):
