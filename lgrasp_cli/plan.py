@@ -1,5 +1,6 @@
 """``lgrasp plan`` and ``refine``: a local search plans grasps from starts all over a surface, or improves grasps."""
 
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -116,9 +117,10 @@ def refine(
 
 def _show_refined(data: dict[str, Any]) -> list[Block]:
     names = ("hand", "object", "rows", "refined", "valid before", "valid", "failed")
-    rows = [
-        (one["hand"], one["object"], *(f"{one[n.replace(' ', '_')]:,}" for n in names[2:])) for one in data["results"]
-    ]
+    sums: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+    for one in data["results"]:
+        sums[one["hand"], one["object"]].update({name: one[name.replace(" ", "_")] for name in names[2:]})
+    rows = [(*pair, *(f"{found[name]:,}" for name in names[2:])) for pair, found in sums.items()]
     points = all(one["points"] for one in data["results"])  # which no simulator takes
     pairs = [closed(data), *ending(data, "rows", "render" if points else "simulate")]
     return [TextTable(names, rows, right=names[2:]), pairs]

@@ -330,7 +330,8 @@ def look(job: Job, *, array: Array | tuple[int, int], resume: bool) -> Todo:
         job.events.said(array.words([part.number for part in parts], job.part))
     check_folder(job.folder)
     whole = job.whole(parts, some=array.lanes == 1)
-    every = [part for part in every if part in whole or part not in parts] if len(whole) < len(parts) else every
+    lost = set(parts) - set(whole)
+    every = [part for part in every if part not in lost]
     return Todo(array, job.device_used, every, whole, job.present(whole) if resume else {})
 
 
