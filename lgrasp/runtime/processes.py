@@ -139,12 +139,12 @@ class ProcessPool(ProcessPoolExecutor):
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         with spared(), _no_main():  # it starts processes
             future = super().submit(fn, *args, **kwargs)
-        processes: Any = self._processes or {}
-        for number in processes.keys() - self._watched:
-            self._watched.add(number)
-            what = processes[number], processes, self._result_queue, self._ending
-            threading.Thread(target=_end_with, args=what, daemon=True).start()
-        return future
+            processes: Any = self._processes or {}
+            for number in processes.keys() - self._watched:
+                self._watched.add(number)
+                what = processes[number], processes, self._result_queue, self._ending
+                threading.Thread(target=_end_with, args=what, daemon=True).start()
+            return future
 
     def start(self, module: str) -> None:
         """Have every process start, and load what a module needs, before there is work."""

@@ -155,9 +155,9 @@ def load_stock(config: SceneRequest, cache: Cache, device: Device, events: Event
     for name in config.objects if config.grasps else ():
         wanted.add(source := mesh_digest(mesh_bytes(find_object(name))))
         if source not in there:
-            known = ", ".join(there.values())
-            same = f"; its '{known}' is another mesh" if Path(name).stem in there.values() else f"; it has {known}"
-            raise ConfigError(f"{config.grasps} has no grasps of object '{name}'{same}")
+            known, stem = there.values(), Path(name).stem
+            other = f"its '{stem}' is another mesh" if stem in known else f"it has {', '.join(known)}"
+            raise ConfigError(f"{config.grasps} has no grasps of object '{name}'; {other}")
     chosen = {key: part for key, part in found.items() if not wanted or part.record.sha256 in wanted}
     events.loading("hand")
     hand, record = load_hand(chosen.values(), config.hand, cache)
