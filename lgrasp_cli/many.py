@@ -53,7 +53,7 @@ def run_all(requests: "Sequence[Request]", how: How, *, dry_run: bool) -> None:
             result, stop = _run_one(request, own)
             results.append(result)
             if stop:
-                stopped = how.cache.more_jobs
+                stopped = number < len(each)
                 break
     if code := _report(results, how, stopped=stopped):
         raise typer.Exit(code)

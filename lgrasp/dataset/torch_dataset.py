@@ -171,8 +171,7 @@ class GraspDataset(TorchRows, torch.utils.data.Dataset):
     Blocks of 4096 rows are decoded at a time and the last used ones kept, so sequential reading is fast at any size and
     random reading as long as the data fits ``cache_bytes``. No file stays open: safe with worker processes, forked or
     spawned, and with any number of shards; give a DataLoader with workers ``persistent_workers=True``, or they read all
-    anew in every epoch. Shards that are missing from a folder, or not listed, by its
-    ``manifest.json`` are reported.
+    anew in every epoch. Shards that are missing from a folder, or not listed, by its ``manifest.json`` are reported.
 
     Args:
         paths, columns, negatives, split, part: as of :class:`TorchRows`.

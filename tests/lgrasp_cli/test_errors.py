@@ -1,5 +1,6 @@
 """Bad input: exit code 2, one line, nothing half-written."""
 
+import errno
 import numpy as np
 import pytest
 import trimesh
@@ -158,6 +159,7 @@ def test_unexpected_failures_are_one_line(generate, monkeypatch):
     for error, words in (
         (MemoryError(), "out of memory"),
         (RuntimeError("can't start new thread"), "no more threads"),
+        (BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable"), "no more threads or processes"),
         (RuntimeError("Failed to allocate 112419840 bytes on device 'cuda:0'"), "out of memory"),
         (FileNotFoundError(2, "No usable temporary directory found in ['/tmp']"), "set TMPDIR"),
         (OSError(28, "No space left on device", "x.h5"), "x.h5: No space left"),
