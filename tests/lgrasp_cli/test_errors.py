@@ -1,6 +1,7 @@
 """Bad input: exit code 2, one line, nothing half-written."""
 
 import errno
+
 import numpy as np
 import pytest
 import trimesh
