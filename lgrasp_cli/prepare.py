@@ -106,7 +106,7 @@ def warm_up(device: Device = "auto", cache_dir: CacheDir = None) -> None:
     """
     open_cache(cache_dir)
     from lgrasp.runtime.device import resolve_device
-    from lgrasp.runtime.kernels import first_time, import_all, kernel_modules, load_kernels, load_preparing
+    from lgrasp.runtime.kernels import first_time, import_all, kernel_modules, load_kernels
     from lgrasp_cli.progress import Bar
 
     chosen = resolve_device(device)
@@ -115,8 +115,7 @@ def warm_up(device: Device = "auto", cache_dir: CacheDir = None) -> None:
     with Bar() as bar:
         if words := first_time(chosen.alias):
             bar.say(words)
-        load_kernels(chosen.alias, modules, bar.share)
-        load_preparing(bar.share)
+        load_kernels(chosen.alias, modules, bar.share, preparing=True)
     typer.echo(f"{len(modules)} modules ready on {chosen.alias} ({chosen.name})")
 
 

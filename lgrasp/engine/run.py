@@ -27,7 +27,7 @@ from lgrasp.notices import notice
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import Device, resolve_device
-from lgrasp.runtime.kernels import first_time, kernel_modules, load_kernels, load_preparing
+from lgrasp.runtime.kernels import first_time, kernel_modules, load_kernels
 from lgrasp.runtime.ordered import in_order
 from lgrasp.words import plural
 
@@ -83,6 +83,9 @@ class Job(Request, ABC):
             LgraspError: an input that was named cannot, or, if there must be ``some``, none can.
         """
         return parts
+
+    def import_kernels(self) -> None:
+        """Import the modules below ``kernels`` that the parts to be made need."""
 
     def warm(self) -> None:
         """Have libraries load what their first call would, once the inputs are loaded and while kernels are."""
@@ -286,9 +289,11 @@ def prepare(job: Job, todo: "Todo") -> float:
     """Load the inputs and kernels of a job that :func:`look` saw; seconds that the kernels took."""
     missing = [part for part in todo.parts if part.number not in todo.present]
     begin = time.perf_counter()
+    if missing:
+        job.import_kernels()
     if missing and job.kernels and (words := first_time(todo.device.alias)):
         job.events.said(words)
-        load_preparing(job.events.loading)
+        load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading, preparing=True)
     kernels = time.perf_counter() - begin
     job.load(job.events, bool(missing))
     begin = time.perf_counter()

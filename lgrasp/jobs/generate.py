@@ -1,18 +1,15 @@
 """The main job: hand + object -> grasp shards in a folder."""
 
 from collections import Counter
-from collections.abc import Collection
 from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic import PrivateAttr, model_validator
 
 from lgrasp.dataset.info import last_survivors, survivors
-from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.bank import Bank
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
@@ -22,7 +19,6 @@ from lgrasp.engine.inputs import InputKeys, Inputs, input_keys, load_inputs, run
 from lgrasp.engine.shard import Execution, gave_up, make_shard
 from lgrasp.errors import ConfigError, LgraspError, StarvedError
 from lgrasp.geometry.mesh_files import mesh_bytes, mesh_digest
-from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.records import ObjectRecord
 from lgrasp.grasp.rows import grasp_rows
 from lgrasp.grasp.tables import take_grasps
@@ -40,9 +36,6 @@ from lgrasp.words import plural
 
 _SHARDS_ON_GPU = 4  # at once
 _MOST_WRITERS = 8
-_MOST_COMPARED = 4_000_000
-"""Rows of a folder among which near-duplicates are looked for: some 400 MB."""
-
 _LOOSE_LOAD = 0.25
 """Bound of the unresisted load that hands of few fingers meet."""
 
@@ -200,7 +193,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         """
         inputs = self.inputs
         made = sum((result.tally for result in outcome.results), Counter())
-        present, counted = count_written(set(outcome.paths) - set(outcome.written), self._moving)
+        written = set(outcome.written)
+        present, counted, near = count_written(outcome.paths, written, self._moving, inputs.device.alias)
         sums = self.sums(outcome, self.pipeline.order)
         if not outcome.results:
             sums["counts"] |= counted
@@ -220,7 +214,7 @@ class GenerateJob(GenerateRequest, SearchJob):
             **{name: both[name] for name in counts},
             **({"negatives": both["negatives"]} if self.negatives else {}),
             "force_closure": both["closed"] / both["rows"] if both["rows"] else None,
-            "near_duplicates": _near_duplicates(outcome.paths, inputs.device.alias),
+            "near_duplicates": near,
             "profile": self.pipeline.bounds.told,
             **{f"{name}_per_s": made[of] / wall if wall else 0.0 for name, of in rates.items()},
             "survivors": survivors(sums["counts"]),
@@ -263,18 +257,3 @@ class GenerateJob(GenerateRequest, SearchJob):
         if asked := self.pipeline.steer.model_dump(exclude_defaults=True):
             words += f"; what is asked ({', '.join(f'steer.{name}' for name in asked)}) may leave few grasps or none"
         return StarvedError(f"{few}; stage {stage} is the bottleneck: {words}")
-
-
-def _near_duplicates(paths: Collection[Path], device: str) -> int:
-    """Rows of all shards together that are near-duplicates of a row before them; of the first _MOST_COMPARED rows."""
-    poses, postures, rows = [], [], 0
-    for path in paths:
-        with ShardReader(path, invalid=False) as reader:
-            poses.append(reader.column("object_pose")[:, 0])
-            postures.append(reader.column("q"))
-            rows += len(reader)
-        if rows >= _MOST_COMPARED:
-            break
-    if not poses:
-        return 0
-    return len(np.unique(near_pairs(np.concatenate(poses), np.concatenate(postures), device)[:, 1]))

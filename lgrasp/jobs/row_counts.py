@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from lgrasp.dataset.info import stage_counts
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.grasp.bounds import GraspBounds, measured_strictly
+from lgrasp.grasp.duplicates import near_pairs
 from lgrasp.grasp.pose_numbers import pose_numbers
 from lgrasp.grasp.records import GraspRows
 from lgrasp.runtime.tally import add_counts
@@ -18,7 +18,9 @@ from lgrasp.runtime.tally import add_counts
 PUBLISHED_FSWO = 0.15
 """Squared frictionless residual below which the program of Lightning Grasp counts a grasp (its paper tells none)."""
 
-_THREADS = 4
+_MOST_COMPARED = 4_000_000
+"""Rows of a folder among which near-duplicates are looked for: some 400 MB."""
+
 _Column = Callable[[str], np.ndarray]
 """Values of the valid rows by flat name."""
 
@@ -36,26 +38,40 @@ def count_made(rows: GraspRows, config: Mapping[str, Any], moving: np.ndarray) -
     return found + Counter(negatives=int((~valid).sum()))
 
 
-def count_written(paths: Collection[Path], moving: np.ndarray) -> tuple[Counter[str], dict[str, dict[str, int]]]:
-    """The same of shards on disk, a few of them in memory at a time, and survivors as the stages report them.
+def count_written(
+    paths: Collection[Path], made: Collection[Path], moving: np.ndarray, device: str
+) -> tuple[Counter[str], dict[str, dict[str, int]], int]:
+    """Counts of a folder's shards, each opened once.
+
+    Args:
+        made: those that are counted already, by :func:`count_made`.
+        moving: as there.
+        device: that looks for near-duplicates.
+
+    Returns:
+        What :func:`count_made` counts, of the others; their survivors, as the stages report them; rows of all shards
+        together that are near-duplicates of a row before them, of the first _MOST_COMPARED rows.
 
     Raises:
         ShardError: a file is damaged.
     """
-
-    def one(path: Path) -> tuple[Counter[str], dict[str, dict[str, int]]]:
-        with ShardReader(path, invalid=False) as reader:
-            found = _count(reader.column, reader.columns, reader.header.config, moving)
-            found += Counter(negatives=int(reader.statistics.get("negatives", 0)))
-            return found, stage_counts(reader.statistics)
-
     whole: Counter[str] = Counter()
     counts: dict[str, dict[str, int]] = {}
-    with ThreadPoolExecutor(_THREADS) as pool:
-        for found, survived in pool.map(one, paths):
-            whole.update(found)
-            add_counts(counts, survived)
-    return whole, counts
+    poses, postures, compared = [], [], 0
+    for path in paths:
+        if path in made and compared >= _MOST_COMPARED:
+            continue
+        with ShardReader(path, invalid=False) as reader:
+            if path not in made:
+                whole.update(_count(reader.column, reader.columns, reader.header.config, moving))
+                whole["negatives"] += int(reader.statistics.get("negatives", 0))
+                add_counts(counts, stage_counts(reader.statistics))
+            if compared < _MOST_COMPARED:
+                poses.append(reader.column("object_pose")[:, 0])
+                postures.append(reader.column("q"))
+                compared += len(reader)
+    near = near_pairs(np.concatenate(poses), np.concatenate(postures), device) if poses else np.zeros((0, 2), int)
+    return whole, counts, len(np.unique(near[:, 1]))
 
 
 def strict_rows(column: _Column, config: Mapping[str, Any]) -> int:

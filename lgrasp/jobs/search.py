@@ -74,9 +74,10 @@ class SearchJob(SearchRequest, Job):
 
             check_installed(resolve_device(self.device).alias, find_protocol(self.protocol))
 
+    def import_kernels(self) -> None:
+        self.pipeline.import_stages()
+
     def load(self, events: Events, missing: bool) -> None:
-        if missing:
-            self.pipeline.import_stages()
         inputs = self.load_inputs(events)
         self._meshes = mesh_blobs(self.keys.source.urdf)
         if missing and self.protocol:

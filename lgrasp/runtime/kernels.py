@@ -49,27 +49,35 @@ def first_time(device: str) -> str:
 PREPARING = [
     f"lgrasp.{name}" for name in ("field.kernels", "hand.arrays", "hand.distance", "hand.pairs", "object.kernels")
 ]
-"""Modules whose kernels make hands, objects and fields."""
+"""Modules whose kernels make hands, objects and fields, on the CPU."""
 
 
-def load_preparing(progress: Callable[[str, float], None] | None = None) -> None:
-    """Compile and load :data:`PREPARING`, side by side; the CPU runs them."""
-    for name in PREPARING:
-        importlib.import_module(name)
-    load_kernels("cpu", PREPARING, progress)
-
-
-def load_kernels(device: str, modules: list[str], progress: Callable[[str, float], None] | None = None) -> None:
+def load_kernels(
+    device: str,
+    modules: list[str],
+    progress: Callable[[str, float], None] | None = None,
+    *,
+    preparing: bool = False,
+) -> None:
     """Compile and load modules for one device, several at a time; elsewhere than so far if the disk has become full.
 
     Args:
         device: ``cpu`` or ``cuda:N``.
         progress: called with (module that is ready, share done).
+        preparing: also :data:`PREPARING` for the CPU, beside the others.
     """
+    devices = {importlib.import_module(name).__name__: ["cpu"] for name in (PREPARING if preparing else ())}
+    for name in modules:
+        devices.setdefault(name, []).append(device)
+
+    def load(name: str) -> None:
+        for each in devices[name]:  # one after the other: Warp has no lock for a module
+            wp.load_module(name, each)
+
     folder = usable_folder(Path(wp.config.kernel_cache_dir))
     wp.config.kernel_cache_dir = str(folder)
     with ThreadPoolExecutor(min(cores(), 8)) as pool:
-        waiting = {pool.submit(wp.load_module, name, device): name for name in modules}
+        waiting = {pool.submit(load, name): name for name in devices}
         for done, future in enumerate(as_completed(waiting), 1):
             future.result()
             note_checksums(folder)

@@ -94,7 +94,7 @@ def test_generating_from_the_cache_imports_nothing_slow(run, cache_root, tmp_pat
     arguments += ["--out", str(tmp_path / "other"), "--cache-dir", str(cache_root)]
     code = f"import sys; sys.argv = {['lgrasp', *arguments]}\nfrom lgrasp_cli.main import main\n"
     code += "from lgrasp.runtime import kernels\nload = kernels.load_kernels\n"
-    code += "kernels.load_kernels = lambda device, modules, told: print(modules) or load(device, modules, told)\n"
+    code += "kernels.load_kernels = lambda device, modules, *a, **k: print(modules) or load(device, modules, *a, **k)\n"
     code += f"try:\n    main()\nfinally:\n    print([m for m in {SLOW} if m in sys.modules])\n"
     code += "    print([m for m in sys.modules if m.startswith(('lgrasp.refine.', 'lgrasp.hand.drafting'))])"
     env = os.environ | {"WARP_CACHE_PATH": str(kernel_folder())}

@@ -91,9 +91,11 @@ class PolicyJob(PolicyRequest, FileJob):
         field = load.field(model, self.keys.field, self.pipeline.field, thumb)
         return upload_hand(model, alias, thumb), upload_field(field, model, alias)
 
+    def import_kernels(self) -> None:
+        self.pipeline.import_stages()
+
     def load(self, events: Events, missing: bool) -> None:
         if missing:
-            self.pipeline.import_stages()
             _ = self.loaded
 
     def make(self, part: Part, progress: PartProgress) -> Made:
