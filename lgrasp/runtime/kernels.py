@@ -74,6 +74,7 @@ def load_kernels(
         for each in devices[name]:  # one after the other: Warp has no lock for a module
             wp.load_module(name, each)
 
+    wp.synchronize_device(device)  # opens it: two threads at a time would each give it a stream
     folder = usable_folder(Path(wp.config.kernel_cache_dir))
     wp.config.kernel_cache_dir = str(folder)
     with ThreadPoolExecutor(min(cores(), 8)) as pool:
