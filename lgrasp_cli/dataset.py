@@ -22,7 +22,8 @@ app = typer.Typer(name="dataset", help="Inspect, check and merge grasp files (sh
 @app.command()
 @reporting
 def info(paths: Shards) -> Answer:
-    """Show rows, hand, objects, pipeline, size and metrics of each shard; for sequences, rows by number of objects.
+    """Show rows, hand, objects, pipeline and size of each shard, metrics of those alike; for sequences, rows by number
+    of objects.
 
     Example: lgrasp dataset info grasps
     """
@@ -223,13 +224,19 @@ def _made_by(shard: dict[str, Any]) -> str:
 
 
 def _metric_table(shards: list[dict[str, Any]]) -> TextTable:
+    """Of shards of the same hand, objects and pipeline together."""
+    from lgrasp.dataset.info import pooled
+
+    alike: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for s in shards:
+        alike.setdefault((s["hand"], ", ".join(s["objects"]), _made_by(s)), []).append(s)
     ends = ("min", "mean", "max")
     rows = [
-        ("" if line else name, metric, values["unit"].partition(":")[0], *(number(values[k], ".4g") for k in ends))
-        for name, s in zip(_places(shards), shards, strict=True)
-        for line, (metric, values) in enumerate(s["metrics"].items())
+        (*(("",) * 3 if line else key), name, unit.partition(":")[0], *(number(values[k], ".4g") for k in ends))
+        for key, those in alike.items()
+        for line, ((name, unit), values) in enumerate(pooled(those).items())
     ]
-    return TextTable(("shard", "metric", "unit", *ends), rows, right=ends)
+    return TextTable(("hand", "objects", "pipeline", "metric", "unit", *ends), rows, right=ends)
 
 
 def _count_table(shards: list[dict[str, Any]], what: str, key: str) -> TextTable:

@@ -19,8 +19,8 @@ def describe(paths: Paths) -> list[dict[str, Any]]:
         ``rows_by_objects`` (rows by the number of objects held),
         ``rows_by_space`` (of sequences: rows by the opposition space of their last step; else None), ``hand``,
         ``objects`` (ids), ``pipeline``, ``grasp_type`` (asked for; else None), ``seed``, ``shard_index``, ``created``,
-        ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset), ``metrics`` (unit, min,
-        mean, max of the finite values; None if there are none) and ``statistics``.
+        ``lgrasp_version``, ``joints`` (names), ``columns`` (shape of each row dataset), ``metrics`` (unit, number
+        of finite values, their min, mean and max; None if there are none) and ``statistics``.
 
     Raises:
         ShardError: No shard is found, or one cannot be read.
@@ -80,7 +80,26 @@ def _describe(reader: ShardReader) -> dict[str, Any]:
 def _range(values: np.ndarray) -> dict[str, float | None]:
     values = values[np.isfinite(values)].astype(np.float64)
     ends = {"min": np.min, "mean": np.mean, "max": np.max}
-    return {name: float(end(values)) if len(values) else None for name, end in ends.items()}
+    return {"finite": len(values)} | {n: float(end(values)) if len(values) else None for n, end in ends.items()}
+
+
+def pooled(shards: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], dict[str, Any]]:
+    """``metrics`` of several shards of :func:`describe` together, by name and unit."""
+    found: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for shard in shards:
+        for name, values in shard["metrics"].items():
+            found.setdefault((name, values["unit"]), []).append(values)
+    return {key: _together([v for v in values if v["finite"]]) for key, values in found.items()}
+
+
+def _together(ranges: list[Mapping[str, Any]]) -> dict[str, Any]:
+    finite = sum(r["finite"] for r in ranges)
+    return {
+        "finite": finite,
+        "min": min((r["min"] for r in ranges), default=None),
+        "mean": sum(r["mean"] * r["finite"] for r in ranges) / finite if finite else None,
+        "max": max((r["max"] for r in ranges), default=None),
+    }
 
 
 Counts = dict[str, dict[str, int]]

@@ -8,7 +8,7 @@ import pytest
 from support.shards import write_manifest
 
 from lgrasp.dataset.files import find_shards
-from lgrasp.dataset.info import describe
+from lgrasp.dataset.info import describe, pooled
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.validate import validate_shard
@@ -140,11 +140,15 @@ def test_describe_and_find(folder, tmp_path):
     gap = read_shard(folder / "9.h5").grasps.metrics["gap"]
     assert nine["metrics"]["gap"] == {
         "unit": "m",
+        "finite": 3,
         "min": gap.min(),
         "mean": pytest.approx(gap.mean()),
         "max": gap.max(),
     }
     assert describe(folder / "8.h5")[0]["metrics"]["gap"]["mean"] is None
+    together = np.concatenate([read_shard(path).grasps.metrics["gap"] for path in find_shards(folder)])
+    ends = {"min": together.min(), "mean": pytest.approx(together.mean(dtype=float)), "max": together.max()}
+    assert pooled(describe(folder))["gap", "m"] == {"finite": len(together), **ends}
     json.dumps([seven, nine])
     with pytest.raises(ShardError, match="no such file or folder"):
         find_shards([folder, tmp_path / "none"])
