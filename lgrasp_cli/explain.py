@@ -28,6 +28,11 @@ def explain(error: BaseException) -> tuple[str, int]:
         return "error: out of memory; lower --workers, or --batch or --shard-rows if the command has them", 2
     if "can't start new thread" in str(error) or getattr(error, "errno", None) == errno.EAGAIN:
         return "error: no more threads or processes are allowed here (ulimit -u or -v, or a container's limit)", 2
+    said = f"{error}: {error.__cause__}" if error.__cause__ else str(error)
+    if "failed to map segment" in said:
+        return "error: no room for a library in virtual memory (ulimit -v, or a batch system's limit)", 2
+    if "shared library" in said or "shared object" in said:
+        return f"error: {said}", 2
     if isinstance(error, FileNotFoundError) and not error.filename and not _has_folder():
         return "error: the current folder is not there any more; change to another one", 2
     if isinstance(error, OSError) and error.errno is not None:

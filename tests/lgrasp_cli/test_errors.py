@@ -164,6 +164,8 @@ def test_unexpected_failures_are_one_line(generate, monkeypatch):
         (RuntimeError("Failed to allocate 112419840 bytes on device 'cuda:0'"), "out of memory"),
         (FileNotFoundError(2, "No usable temporary directory found in ['/tmp']"), "set TMPDIR"),
         (OSError(28, "No space left on device", "x.h5"), "x.h5: No space left"),
+        (ImportError("x.so: failed to map segment from shared object"), "no room for a library in virtual memory"),
+        (ImportError("libGL.so.1: cannot open shared object file"), "error: libGL.so.1: cannot open shared object"),
     ):
 
         def fail(*_, error=error, **__):
