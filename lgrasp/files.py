@@ -24,6 +24,7 @@ try:
 except ImportError:  # Windows: leftovers cannot be distinguished from files being written
     fcntl = None
 
+_HEAD = 512  # bytes by which the kind of a file is known
 _LONGEST_NAME = 255  # bytes, of a file
 _TEMPORARY = re.compile(r"\.([0-9a-f]{6})[0-9a-f]{6}-[0-9a-f]{12}\b")  # the computer in a temporary file's name
 FOREIGN_AGE = 86_400.0
@@ -93,6 +94,25 @@ def check_file(path: str | os.PathLike[str]) -> None:
         check_folder(path.parent)
     except OutputError as error:
         raise OutputError(f"file {path}: {str(error).replace('choose another with --out', 'name another')}") from None
+
+
+def check_kind(path: str | os.PathLike[str], what: str, begins: str) -> None:
+    """Check that a file which is to be replaced, if there is one, is of the kind that is written there.
+
+    Args:
+        what: the kind, for the message.
+        begins: pattern of its first characters.
+
+    Raises:
+        OutputError: it is of another kind, or cannot be read.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return
+    with writing(path), open(path, "rb") as file:
+        head = file.read(_HEAD).lstrip()
+    if head and not re.match(begins.encode(), head, re.IGNORECASE):
+        raise OutputError(f"file {path} is there and is no {what}; it stays: name another")
 
 
 def write_file(path: str | os.PathLike[str], data: bytes | str, *, flush: bool = True) -> None:

@@ -71,12 +71,16 @@ def check_report(path: str | None) -> None:
     """Fail before the job if its report could not be written.
 
     Raises:
-        OutputError: a folder, or one that cannot be written.
+        OutputError: a folder, or one that cannot be written; a file of another kind, or that is named like one.
     """
     if path and path != "-":
-        from lgrasp.files import check_file
+        from lgrasp.errors import OutputError
+        from lgrasp.files import check_file, check_kind
 
         check_file(path)
+        if Path(path).suffix.lower() not in ("", ".json") or Path(path).name == "manifest.json":
+            raise OutputError(f"--json {path}: a report is JSON, and no manifest; name a file such as report.json")
+        check_kind(path, "report in JSON", r'[\[{](?!\s*"format":\s*"lgrasp)')
 
 
 def warn(line: str) -> None:

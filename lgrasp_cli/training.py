@@ -31,12 +31,10 @@ def split_rows(
 
     Example: lgrasp dataset split grasps --by object -o split.json
     """
-    from lgrasp.files import check_file
-
     parts = _shares(shares)
-    check_file(out)
-    from lgrasp.dataset.split import make_split
+    from lgrasp.dataset.split import Split, make_split
 
+    Split.check_place(out)
     made = make_split(paths, by=by, shares=parts, seed=seed, negatives=negatives)  # ty: ignore[invalid-argument-type]
     made.write(out)
     rows = [(name, f"{part.rows:,}", listed([*dict.fromkeys(part.names)], 4)) for name, part in made.parts.items()]
@@ -59,11 +57,9 @@ def normalisation(
 
     Example: lgrasp dataset normalisation grasps --split split.json -o normalisation.json
     """
-    from lgrasp.files import check_file
-
-    check_file(out)
     from lgrasp.dataset.normalisation import Normalisation
 
+    Normalisation.check_place(out)
     made = Normalisation.of(paths, split=split_file, part=part, negatives=negatives)
     made.write(out)
     numbers = zip(made.names, made.mean, made.std, strict=True)

@@ -2,12 +2,13 @@
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import ClassVar, Self
 
 from lgrasp.config import Params, parse_model
 from lgrasp.errors import ConfigError
-from lgrasp.files import write_file
+from lgrasp.files import check_file, check_kind, write_file
 
 
 class JsonFile(Params):
@@ -38,11 +39,22 @@ class JsonFile(Params):
             raise ConfigError(f"{kind} {path}: version {version}; {cls.VERSION} is read")
         return parse_model(cls, data, f"{kind} {path}")
 
+    @classmethod
+    def check_place(cls, path: str | os.PathLike[str]) -> None:
+        """Check that a file can be written there, and that none of another kind is there.
+
+        Raises:
+            OutputError: one is, or none can.
+        """
+        check_file(path)
+        check_kind(path, cls.__name__.lower(), rf'\{{\s*"format":\s*"{re.escape(cls.FORMAT)}"')
+
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write it.
 
         Raises:
-            OutputError: the file cannot be written.
+            OutputError: as of :meth:`check_place`.
         """
+        self.check_place(path)
         data = {"format": self.FORMAT, "version": self.VERSION, **self.model_dump(mode="json", exclude_defaults=True)}
         write_file(path, json.dumps(data, indent=1) + "\n")

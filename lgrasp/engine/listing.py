@@ -149,7 +149,9 @@ class Listing:
         with self._lock, self._seldom.noted():
             for folder, unlisted in self._unlisted.items():
                 if unlisted:
-                    update_manifest(folder, partial(_record, self.run, folder, list(unlisted.values())))
+                    made, asked = self._made[folder], map(self._entry, self._every[folder])
+                    every = [made.get(shard.file, shard) for shard in asked]
+                    update_manifest(folder, partial(_record, self.run, folder, every, list(unlisted.values())))
                     unlisted.clear()
 
     def close(self) -> None:
@@ -172,9 +174,20 @@ class Listing:
         return ListedShard(file=part.file.name, shard_index=part.shard_index, asked=asked)
 
 
-def _record(run: ListedRun, folder: Path, shards: Sequence[tuple[ListedShard, int]], manifest: Manifest) -> None:
-    """Take up files of a run; one that was replaced since its SHA-256 was made (its time is another) as it is now."""
-    now = []
+def _record(
+    run: ListedRun,
+    folder: Path,
+    every: Sequence[ListedShard],
+    shards: Sequence[tuple[ListedShard, int]],
+    manifest: Manifest,
+) -> None:
+    """Take up files of a run; one that was replaced since its SHA-256 was made (its time is another) as it is now.
+
+    Args:
+        every: all that is asked of the run in the folder, again in case that its manifest was removed.
+    """
+    known = {shard.file for shard in manifest.shards}
+    now = [shard for shard in every if shard.file not in known]
     for shard, time_ns in shards:
         changed = shard.sha256 and _time(folder / shard.file) not in (0, time_ns)
         now.append(listed(shard, folder / shard.file, shard.rows or 0) if changed else shard)

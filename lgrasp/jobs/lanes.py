@@ -11,7 +11,7 @@ from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events, JobOutcome, Made, Part
 from lgrasp.engine.request import Request
 from lgrasp.engine.run import Job, look, own_parts, prepare, run
-from lgrasp.errors import LgraspError
+from lgrasp.errors import DeviceError, LgraspError
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.runtime.processes import Crew, Link
@@ -55,13 +55,19 @@ class Lanes(ExitStack):
             there = [part for part in todo.parts if self._resume and part.file.exists()]
             job.present(there[:1])  # another run's folder is refused at once
             outcome.seconds["kernels"] = prepare(job, todo._replace(present={part.number: 0 for part in there}))
-            crew = self._crew = self.enter_context(self._started())
+            crew = self._crew = self.enter_context(self._started(number))
         events.started(todo.parts, {})
         making = time.perf_counter()
         try:
             self._wait(crew, number, events)
             if not first:
                 job.load(events, False)
+        except DeviceError:  # of a lane that ended; the next job starts them again
+            self.close()
+            self._crew = None
+            self._ends.clear()
+            self._told.clear()
+            raise
         finally:
             job.close()
         outcome.cancelled = len(self._ends[number]) < len(self._devices)  # lanes that were stopped before they began
@@ -80,12 +86,13 @@ class Lanes(ExitStack):
         outcome.seconds = {"kernels": 0.0} | outcome.seconds | {"parts": end - making, "total": end - begin}
         return outcome
 
-    def _started(self) -> Crew:
+    def _started(self, first: int) -> Crew:
+        """Lanes for the jobs from one on."""
         jobs = [(type(job), {k: v for k, v in job.values().items() if k != "cache"}) for job in self._jobs]
-        shared = jobs, self._arrays, self._cache.root, self._resume
+        shared = jobs, first, self._arrays, self._cache.root, self._resume
         count = len(self._devices)
         tasks = [(device.alias, lane, count, *shared) for lane, device in enumerate(self._devices)]
-        return Crew(_make_share, tasks, [device.alias for device in self._devices])
+        return Crew(_make_share, tasks, [f"{d.alias} (lane {n} of {count})" for n, d in enumerate(self._devices, 1)])
 
     def _wait(self, crew: Crew, number: int, events: Events) -> None:
         """Until all lanes are done with a job, one failed, or all have ended."""
@@ -152,13 +159,15 @@ def _make_share(
     lane: int,
     lanes: int,
     jobs: Sequence[tuple[type[Request], dict[str, Any]]],
+    first: int,
     arrays: Sequence[Array],
     root: Any,
     resume: bool,
 ) -> None:
-    """The work of a lane: its parts of all jobs, one after another."""
+    """The work of a lane: its parts of all jobs from the first on, one after another."""
     cache = Cache(root)
-    for number, ((kind, values), array) in enumerate(zip(jobs, arrays, strict=True)):
+    for number in range(first, len(jobs)):
+        (kind, values), array = jobs[number], arrays[number]
         if link.stopped():
             return
         cache.warn = lambda line, number=number: link.send((number, line))

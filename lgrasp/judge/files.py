@@ -68,6 +68,8 @@ def check_report(path: str) -> None:
         raise JudgeError(f"file {path} cannot be written: it is a folder; name a file")
     if _is_special(path):
         return
+    if Path(path).suffix.lower() not in ("", ".json") or Path(path).name == "manifest.json":
+        raise JudgeError(f"file {path} cannot be written: findings are JSON; name a file such as findings.json")
     nearest = next(folder for folder in Path(os.path.realpath(path)).parents if folder.exists())
     try:
         tempfile.TemporaryFile(dir=nearest).close()

@@ -72,6 +72,18 @@ def test_a_cut_run_lists_what_is_missing_and_ends_like_a_whole_one(tmp_path):
     assert cut.stat().st_mtime_ns == before
 
 
+def test_a_manifest_that_was_removed_meanwhile_lists_again_what_is_asked(tmp_path):
+    class Removing(SampleJob):
+        def make(self, part, progress):
+            if part.number == 1:
+                (self.out / "manifest.json").unlink()
+            return super().make(part, progress)
+
+    run(Removing(out=tmp_path), StopAfter(2))
+    assert entries(tmp_path) == [(2, 2), (2, 2), (2, None)]
+    assert differences(tmp_path).missing == ["toy-cup-00002.h5"]
+
+
 def test_of_two_runs_side_by_side_each_file_is_listed_as_it_is(tmp_path):
     """The second makes the first's files again once these are listed, and ends before it."""
 

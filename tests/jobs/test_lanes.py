@@ -1,5 +1,7 @@
 """One command on several devices: lanes make the files of a single process; they fail, stop and end as one job does."""
 
+import os
+import signal
 import time
 
 import numpy as np
@@ -10,7 +12,7 @@ from lgrasp.dataset.reader import read_shard
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events
 from lgrasp.engine.run import run
-from lgrasp.errors import ObjectError
+from lgrasp.errors import DeviceError, ObjectError
 from lgrasp.jobs.lanes import Lanes
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.device import resolve_devices
@@ -28,6 +30,15 @@ class FailingJob(SampleJob):
 class SlowJob(SampleJob):
     def make(self, part, progress):
         time.sleep(0.05)
+        return super().make(part, progress)
+
+
+class DyingJob(SampleJob):
+    """Its third part is the end of the process that makes it."""
+
+    def make(self, part, progress):
+        if part.number == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
         return super().make(part, progress)
 
 
@@ -74,4 +85,15 @@ def test_lanes_share_the_files_of_jobs(tmp_path):
         cut = lanes.outcome(3, jobs[3], StopAfter(1))
         assert cut.cancelled
     assert len(list(jobs[3].out.glob("*.h5"))) == len(cut.written) < 40
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_a_lane_that_is_killed_fails_its_job_alone(tmp_path):
+    jobs = [kind(out=tmp_path / kind.__name__, rows=10, device="cpu") for kind in (DyingJob, SlowJob)]
+    cache = Cache(tmp_path / "cache")
+    with Lanes(resolve_devices("cpu,cpu"), jobs, [Array()] * 2, cache, resume=True) as lanes:
+        with pytest.raises(DeviceError, match=r"on cpu \(lane 1 of 2\) ended by signal 9; the same command"):
+            lanes.outcome(0, jobs[0], Events())
+        made = lanes.outcome(1, jobs[1], Events())
+        assert (made.rows, made.cancelled) == (10, False)
     assert not list(tmp_path.rglob("*.tmp"))

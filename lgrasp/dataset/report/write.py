@@ -19,7 +19,7 @@ from lgrasp.dataset.report.tables import Block
 from lgrasp.dataset.report.verdicts import held_numbers
 from lgrasp.dataset.scenes import SceneRows, draw_rows
 from lgrasp.errors import LgraspError, OutputError
-from lgrasp.files import write_file
+from lgrasp.files import check_kind, write_file
 from lgrasp.picture.sheet import image_bytes
 from lgrasp.runtime.device import resolve_device
 
@@ -38,10 +38,11 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
 
     Raises:
         ShardError: No shard is found, or one cannot be read.
-        OutputError: ``out`` cannot be written.
+        OutputError: ``out`` cannot be written, or something else is there.
     """
     if out.exists() and not out.is_file():
         raise OutputError(f"report {out} cannot be written: it is no regular file; name another")
+    check_kind(out, "HTML page", "<!doctype html")
     heads, remarks = survey(paths)
     numbers, hands = _read(heads, remarks, progress, near=True)
     write_file(out, page(numbers, hands, pictures(sorted(head.path for head in heads)) if numbers["rows"] else ()))
