@@ -162,6 +162,8 @@ def find_yaml(name: str, files: Mapping[str, Path], what: str) -> Path:
         ConfigError: neither.
     """
     path = files.get(name) or user_path(name)
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise ConfigError(f"{what} {path} is no regular file; give the path of a YAML file")
     if not os.path.isfile(path):
         hint, known = did_you_mean(path.stem, files), ", ".join(files) or "none"
         raise ConfigError(f"unknown {what} '{name}'; {hint}known: {known}, or give the path of a YAML file")
@@ -239,7 +241,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
         if size > _YAML_BYTES:
             raise yaml.YAMLError(f"it has {size:,} bytes; at most {_YAML_BYTES:,} are read")
         data = load_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:  # ValueError: not UTF-8
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"file {path} cannot be read: byte {error.start} is no UTF-8; save it as UTF-8") from None
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(f"file {path} cannot be read: {short_reason(error, 300)}") from None
     if not isinstance(data, dict):
         raise ConfigError(f"file {path} must hold a YAML mapping, found {type(data).__name__}")

@@ -37,6 +37,7 @@ def explain(error: BaseException) -> tuple[str, int]:
         return "error: the current folder is not there any more; change to another one", 2
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
+        where = where or ("what is printed, or a temporary file: " if error.errno == errno.ENOSPC else "")
         hint = "; set TMPDIR to one that can be written" if "temporary directory" in str(error.strerror) else ""
         return f"error: {where}{error.strerror}{hint}", 2
     return f"error: unexpected {type(error).__name__}: {error} (set LGRASP_DEBUG=1 for the traceback)", 1

@@ -20,6 +20,8 @@ WORDS = {"allow_interspersed_args": False}
 """Settings of the command: from its first word on, the words are those of the other command."""
 
 _PATIENCE = 60.0  # [s] for sbatch
+_OWN = {"array": "--tasks", "job-name": "--name", "output": "--logs"}
+"""Options of sbatch that have another name here, since the report is of them."""
 
 
 @reporting
@@ -65,10 +67,10 @@ def submit(
     name = name or f"lgrasp-{words[0]}"
     if not re.fullmatch(r"[\w.+-]+", name):
         raise ConfigError(f"--name '{name}' may hold letters, digits and '.', '_', '+', '-' only")
-    output = str(logs.absolute() / ("%x-%A_%a.log" if tasks > 1 else "%x-%j.log"))
+    pattern = "%x-%A_%a.log" if tasks > 1 else "%x-%j.log"
     options = {
         "job-name": name,
-        "output": output,
+        "output": str(logs.absolute()).replace("%", "%%") + f"/{pattern}",
         "open-mode": "append",  # of a task that is requeued
         "array": f"0-{tasks - 1}" if tasks > 1 else None,
         "gres": f"gpu:{gpus}" if gpus else None,
@@ -77,7 +79,7 @@ def submit(
         "time": limit,
         "partition": partition,
         "account": account,
-    } | _more(more or [])
+    } | _more(more or [], tasks)
     script = _script({option: str(value) for option, value in options.items() if value is not None}, words)
     if dry_run:
         return Answer({"script": script, "tasks": tasks, "files": parts}, [script, "dry run: nothing was submitted"])
@@ -85,11 +87,12 @@ def submit(
         typer.echo(script)
         raise ConfigError("there is no sbatch here: nothing was submitted; this is the script")
     job, path = _submit(script, logs, name)
+    log = re.sub("%[xAja]", lambda sign: {"%x": name, "%a": "TASK"}.get(sign[0], job or "JOB"), pattern)
     pairs = [
-        ("job", f"{job}: {plural(tasks, 'task')}, {plural(parts, 'file')}"),
+        ("job", f"{job or 'number unknown'}: {plural(tasks, 'task')}, {plural(parts, 'file')}"),
         ("script", str(path)),
-        ("logs", output.replace("%x", name).replace("%A", job).replace("%j", job).replace("%a", "TASK")),
-        ("cancel", f"scancel {job}"),
+        ("logs", str(logs.absolute() / log)),
+        ("cancel", f"scancel {job or f'--name {name}'}"),
     ]
     return Answer({"job": job, "tasks": tasks, "files": parts, "script": str(path), "logs": str(logs)}, [pairs])
 
@@ -112,7 +115,7 @@ def _checked(program: Any, words: list[str]) -> list[tuple[int, str]]:
     return found
 
 
-def _more(options: list[str]) -> dict[str, str]:
+def _more(options: list[str], tasks: int) -> dict[str, str]:
     from lgrasp.errors import ConfigError
 
     found = {}
@@ -120,6 +123,9 @@ def _more(options: list[str]) -> dict[str, str]:
         name, sign, value = option.partition("=")
         if not re.fullmatch(r"[a-z][a-z-]*", name := name.removeprefix("--")):
             raise ConfigError(f"--sbatch '{option}': give a long name of sbatch, and its value, such as qos=high")
+        if name in _OWN and not (name == "array" and re.fullmatch(rf"0-{tasks - 1}%[1-9][0-9]*", value)):
+            few = f"; array=0-{tasks - 1}%4 lets 4 run at a time" if name == "array" and tasks > 1 else ""
+            raise ConfigError(f"--sbatch '{option}': give {_OWN[name]} instead{few}")
         found[name] = value if sign else ""
     return found
 
@@ -138,7 +144,7 @@ def _script(options: dict[str, str], words: list[str]) -> str:
         if key in os.environ
     ]
     if "array" in options:  # tasks that are submitted again know the whole
-        kept.append(f"export {SUBMITTED}={shlex.quote(options['array'])}")
+        kept.append(f"export {SUBMITTED}={shlex.quote(options['array'].partition('%')[0])}")
     # no module of the folder that it runs in gets in the way, unless that is where lgrasp is
     alone = [] if Path.cwd() == Path(__file__).resolve().parents[1] else ["-P"]
     run = shlex.join([sys.executable, *alone, "-m", "lgrasp_cli", *words])
@@ -146,11 +152,15 @@ def _script(options: dict[str, str], words: list[str]) -> str:
 
 
 def _submit(script: str, logs: Path, name: str) -> tuple[str, Path]:
-    """Number of the submitted job, and the script's file."""
-    from lgrasp.errors import ConfigError
+    """Number of the submitted job, "" if sbatch tells none, and the script's file."""
+    from lgrasp.errors import ConfigError, OutputError
     from lgrasp.files import check_folder, write_file
+    from lgrasp.notices import notice
 
-    check_folder(logs)
+    try:
+        check_folder(logs)
+    except OutputError as error:
+        raise ConfigError(str(error).replace("--out", "--logs")) from None
     logs.mkdir(parents=True, exist_ok=True)  # SLURM makes none
     own = {key: value for key, value in os.environ.items() if key != "TMPDIR"}  # which goes with this process
     try:
@@ -160,6 +170,8 @@ def _submit(script: str, logs: Path, name: str) -> tuple[str, Path]:
             env=own,
             capture_output=True,
             text=True,
+            encoding="utf-8",
+            errors="replace",
             timeout=_PATIENCE,
             check=False,
         )
@@ -168,7 +180,13 @@ def _submit(script: str, logs: Path, name: str) -> tuple[str, Path]:
     if done.returncode:
         reason = done.stderr.strip().removeprefix("sbatch: ") or f"exit code {done.returncode}"
         raise ConfigError(f"sbatch refuses it: {reason}")
-    job = done.stdout.strip().split(";")[0]
-    path = logs / f"{name}-{job}.sh"
-    write_file(path, script)
+    # a number, perhaps with a cluster; some sites print more around it
+    job = (re.findall(r"^([0-9]+)(?:;\S*)?\s*$", done.stdout, re.MULTILINE) or [""])[-1]
+    if not job:
+        notice(f"the job is submitted, but sbatch tells no number of it: '{' '.join(done.stdout.split())[:200]}'")
+    path = logs / (f"{name}-{job}.sh" if job else f"{name}.sh")
+    try:
+        write_file(path, script)
+    except OutputError as error:
+        notice(f"job {job} is submitted, but {error}")
     return job, path

@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
@@ -119,7 +120,7 @@ class SceneRows:
             ConfigError: There is no such row.
         """
         path, number = self.place(row)
-        hand, objects, _ = self._contents(path)
+        hand, objects, _ = self._contents(path, _when(path))
         return hand, objects, self._row(path, number, _when(path))
 
     def scene(self, row: int) -> "GraspScene":
@@ -194,11 +195,17 @@ class SceneRows:
 
     def friction(self, row: int) -> float:
         """The friction at which the row was checked."""
-        return self._contents(self.place(row)[0]).friction
+        path, _ = self.place(row)
+        return self._contents(path, _when(path)).friction
 
     def caption(self, row: int, among: Sequence[int]) -> str:
-        """What tells a row from others: its number, and hand and objects where these differ."""
-        return self.captions((row, *among))[0]
+        """What tells a row from others that can be read: its number, and hand and objects where these differ."""
+        known = [row]
+        for other in among:
+            with suppress(ShardError):
+                self.read(other)
+                known.append(other)
+        return self.captions(known)[0]
 
     def captions(self, chosen: Sequence[int]) -> list[str]:
         """What tells some rows from each other."""
@@ -263,7 +270,7 @@ def draw_motion(
 
 
 def _when(path: Path) -> int:
-    """When a file was written [ns]: verdicts may be added to it while its rows are shown."""
+    """When a file was written [ns]: it may be replaced, or get verdicts, while its rows are shown."""
     return path.stat().st_mtime_ns if path.exists() else 0
 
 
@@ -275,10 +282,12 @@ def _count(path: Path) -> int:
 
 def _row(path: Path, number: int, _: int) -> GraspRows:
     with ShardReader(path) as reader:
+        if number >= len(reader):
+            raise ShardError(f"{path} was replaced: it has {len(reader):,} rows, and no row {number:,}; open it again")
         return reader.rows(number, number + 1)
 
 
-def _contents(path: Path) -> _Contents:
+def _contents(path: Path, _: int) -> _Contents:
     check_heaps(path)
     with ShardReader(path) as reader:
         try:

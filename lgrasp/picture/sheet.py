@@ -75,7 +75,8 @@ def check_image(path: Path, suffixes: Collection[str] = FORMATS.keys()) -> None:
         OutputError: another suffix, a folder, or a place that cannot be written.
     """
     if path.suffix.lower() not in suffixes or path.is_dir():
-        raise OutputError(f"picture {path} cannot be written: name a file that ends in {', '.join(suffixes)}")
+        why = "it is a folder; " if path.is_dir() else ""
+        raise OutputError(f"picture {path} cannot be written: {why}name a file that ends in {', '.join(suffixes)}")
     check_file(path)
 
 

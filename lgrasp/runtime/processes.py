@@ -109,7 +109,8 @@ class Crew:
                 self._processes[number].join()
                 if code := self._processes[number].exitcode:
                     how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-                    raise DeviceError(f"the process on {self._names[number]} ended {how}; the same command goes on") from None
+                    name = self._names[number]
+                    raise DeviceError(f"the process on {name} ended {how}; the same command goes on") from None
         return found
 
 

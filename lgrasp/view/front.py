@@ -52,7 +52,7 @@ class Front:
     def url(self) -> str:
         """What to open, of this computer's name if all of its addresses are listened on."""
         host = socket.gethostname() if self.host in {"0.0.0.0", "::"} else self.host
-        return f"http://{host}:{self.port}"
+        return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
 
     def close(self) -> None:
         """End all connections."""

@@ -58,7 +58,8 @@ def open_site(host: str, port: int, title: str) -> Site:
     """
     viser = import_optional("the viewer needs viser", '"lgrasp[view]"', "viser", error=ConfigError)
     try:
-        socket.create_server((host, 0)).close()
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, 0), family=family).close()
     except OSError as error:
         raise ConfigError(
             f"--host {host}: {str(error.strerror).partition(' (')[0]}; name an address of this computer"

@@ -59,6 +59,18 @@ def test_captions_tell_what_differs(folder):
     assert rows.caption(4, [0, 4]) == "other · row 4"
 
 
+def test_files_that_change_while_they_are_looked_at(folder):
+    rows = SceneRows(folder)
+    assert rows.read(2)[0].name == rows.read(0)[0].name
+    write_shard(folder / "a" / "a.h5", jaw_shard(folder / "urdf", jaw_rows(0.002, count=1)))
+    with pytest.raises(ShardError, match=r"a\.h5 was replaced: it has 1 rows, and no row 2; open it again"):
+        rows.scene(2)
+    (folder / "a" / "a.h5").unlink()
+    assert rows.caption(4, [0, 4]) == "row 4"
+    with pytest.raises(ShardError, match=r"a\.h5"):
+        rows.read(0)
+
+
 def test_captions_name_what_a_row_holds(tmp_path, make_sequence):
     shard = make_sequence((1, 1))
     write_shard(tmp_path / "a.h5", shard)

@@ -48,3 +48,26 @@ def test_validate_is_the_old_name_of_check(cli, folder):
     assert old.out == new.out
     words = "'lgrasp dataset validate' is now 'lgrasp dataset check'; the old name works in this release only"
     assert (old.err, new.err) == (f"warning: {words}\n", "")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info", "--json"),
+        ("report", "--out"),
+        ("split", "--by", "pose", "--out"),
+        ("normalisation", "--out"),
+    ],
+)
+def test_files_of_another_kind_stay(cli, folder, words):
+    (folder / "manifest.json").write_text('{"format": "lgrasp-manifest"}')
+    (folder / "copy.json").write_text('{\n "format": "lgrasp-manifest"}')
+    (folder / "mesh").write_text("v 0 0 0\n")
+    for name in ("0.h5", "manifest.json", "copy.json", "mesh"):
+        before = (folder / name).read_bytes()
+        assert name in cli("dataset", words[0], folder, *words[1:], folder / name).error()
+        assert (folder / name).read_bytes() == before
+    again = folder / "again.json"
+    for _ in range(2):
+        assert cli("dataset", words[0], folder, *words[1:], again).code == 0
+        assert again.stat().st_size

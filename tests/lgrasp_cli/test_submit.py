@@ -56,6 +56,37 @@ def test_a_command_is_submitted_with_its_words_and_this_python(cli, sbatch, tmp_
     assert not (tmp_path / words[-1]).exists()  # checked, not run
 
 
+@pytest.mark.parametrize(
+    ("printed", "number", "told"),
+    [
+        ("printf -- '----- Welcome 2 X -----\\n\\n4711\\n'", "4711", ""),
+        ("printf '\\377 4711\\n'", "", "sbatch tells no number of it: '\ufffd 4711'"),
+        ("true", "", "sbatch tells no number of it: ''"),
+    ],
+)
+def test_the_number_is_found_in_what_sbatch_prints(cli, sbatch, tmp_path, printed, number, told):
+    sbatch(printed)
+    shown = cli("submit", "--logs", "50%job", "--json", "-", "--", "generate", "--object", "tiny", "-n", 5)
+    assert (shown.code, json.loads(shown.out)["job"]) == (0, number)
+    assert told in shown.err
+    (script,) = (tmp_path / "50%job").iterdir()
+    assert script.name == (f"lgrasp-generate-{number}.sh" if number else "lgrasp-generate.sh")
+    assert f"--output={tmp_path}/50%%job/%x-%j.log" in script.read_text()
+
+
+def test_tasks_may_run_a_few_at_a_time(cli, sbatch, tmp_path):
+    words = ["--", "generate", "--object", "tiny", "-n", 20, "--shard-rows", 10]
+    assert cli("submit", "--tasks", 2, "--sbatch", "array=0-1%1", *words).code == 0
+    script = (tmp_path / "bin" / "script").read_text()
+    assert "#SBATCH --array=0-1%1\n" in script
+    assert "export LGRASP_ARRAY=0-1\n" in script
+    assert (
+        "give --tasks instead; array=0-1%4 lets" in cli("submit", "--tasks", 2, "--sbatch", "array=0-5", *words).error()
+    )
+    (tmp_path / "file").touch()
+    assert "choose another with --logs" in cli("submit", "--logs", "file", *words).error()
+
+
 def test_tasks_of_several_gpus_use_them_all(cli, sbatch, tmp_path):
     shown = cli("submit", "--gpus", 4, "--dry-run", "--json", "-", "--", "generate", "--object", "tiny", "-n", 5)
     data = json.loads(shown.out)

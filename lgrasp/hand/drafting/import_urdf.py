@@ -99,7 +99,7 @@ def import_urdf(
                 meshes = partial(find_mesh, urdf, mesh_dirs=mesh_dirs)
                 spec, changes = _fill(robot, file, name, made, meshes, originals, notes)
         except OutputError as error:
-            raise HandError(f"hand folder {error}; choose another with --out") from None
+            raise HandError(f"{error}; choose another with --out") from None
         except LgraspError as error:
             # messages name the user's files, not copies that are gone
             text = str(error)

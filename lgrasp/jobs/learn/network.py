@@ -1,5 +1,6 @@
 """What the jobs that train a network on shards and keep it in one file share."""
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +37,20 @@ class FileJob(Job):
     @property
     def folder(self) -> Path:
         return self.parts()[0].file.parent
+
+    def found(self, part: Part) -> Found:
+        try:
+            return Found(self.stored_key(part.file), part.rows)
+        except ConfigError as error:
+            raise ConfigError(f"{error}; choose another --out, or --overwrite to replace it") from None
+
+    @abstractmethod
+    def stored_key(self, path: Path) -> str | None:
+        """The content key in a file.
+
+        Raises:
+            ConfigError: it is damaged, or something else.
+        """
 
     def write(self, part: Part, contents: Any) -> None:
         write_file(part.file, contents)
@@ -85,9 +100,9 @@ class NetworkJob(FitRequest, FileJob):
         self.enough(learnt, what, least, len(steps.t) - learnt)
         return unseen
 
-    def found(self, part: Part) -> Found:
-        with open_network(part.file, *self.kind) as (card, _):
-            return Found(card.get("run_key"), part.rows)
+    def stored_key(self, path: Path) -> str | None:
+        with open_network(path, *self.kind) as (card, _):
+            return card.get("run_key")
 
     def report(self, outcome: JobOutcome) -> dict[str, Any]:
         return read_card(self.out)["report"] | {"out": str(self.out)} if outcome.paths else {}

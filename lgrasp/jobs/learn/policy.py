@@ -5,13 +5,13 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Events, JobOutcome, Made, Part, PartProgress
-from lgrasp.engine.folder import Found
 from lgrasp.engine.inputs import InputKeys, Loader, input_keys, object_key
 from lgrasp.engine.pipeline import Pipeline
 from lgrasp.errors import ConfigError
@@ -76,8 +76,8 @@ class PolicyJob(PolicyRequest, FileJob):
         """Objects to learn from."""
         return len(self.objects) or self.params.shapes
 
-    def found(self, part: Part) -> Found:
-        return Found(read_policy(part.file).about.get("run_key"), part.rows)
+    def stored_key(self, path: Path) -> str | None:
+        return read_policy(path).about.get("run_key")
 
     def about(self) -> dict[str, Any]:
         return {"hand": self.keys.source.name, "objects": list(self.objects), "pipeline": self.pipeline.name}
