@@ -22,7 +22,7 @@ app = typer.Typer(name="dataset", help="Inspect, check and merge grasp files (sh
 @app.command()
 @reporting
 def info(paths: Shards) -> Answer:
-    """Show rows, hand, objects, pipeline and size of shards, metrics of those alike; for sequences, rows by object count.
+    """Show rows, hand, objects, pipeline and size of shards, metrics of those alike, rows of sequences by object count.
 
     Example: lgrasp dataset info grasps
     """
