@@ -110,7 +110,7 @@ def check_kind(path: str | os.PathLike[str], what: str, begins: str) -> None:
     if not path.is_file():
         return
     with writing(path), open(path, "rb") as file:
-        head = file.read(_HEAD).lstrip()
+        head = file.read(_HEAD).removeprefix(b"\xef\xbb\xbf").lstrip()
     if head and not re.match(begins.encode(), head, re.IGNORECASE):
         raise OutputError(f"file {path} is there and is no {what}; it stays: name another")
 

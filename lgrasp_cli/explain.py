@@ -31,13 +31,14 @@ def explain(error: BaseException) -> tuple[str, int]:
     said = f"{error}: {error.__cause__}" if error.__cause__ else str(error)
     if "failed to map segment" in said:
         return "error: no room for a library in virtual memory (ulimit -v, or a batch system's limit)", 2
-    if "shared library" in said or "shared object" in said:
+    if "cannot open shared object" in said or "Failed to load the shared library" in said:
         return f"error: {said}", 2
     if isinstance(error, FileNotFoundError) and not error.filename and not _has_folder():
         return "error: the current folder is not there any more; change to another one", 2
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
-        where = where or ("what is printed, or a temporary file: " if error.errno == errno.ENOSPC else "")
+        if not where and error.strerror == os.strerror(errno.ENOSPC):
+            where = "what is printed, or a file in TMPDIR or /dev/shm: "
         hint = "; set TMPDIR to one that can be written" if "temporary directory" in str(error.strerror) else ""
         return f"error: {where}{error.strerror}{hint}", 2
     return f"error: unexpected {type(error).__name__}: {error} (set LGRASP_DEBUG=1 for the traceback)", 1

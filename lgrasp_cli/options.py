@@ -67,6 +67,10 @@ Copies = Annotated[Path | None, Option(help="Write copies into this folder; by d
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print no progress and no report, only warnings and errors.")]
 
 
+_OTHER_KINDS = {".h5", ".html", ".png", ".jpg", ".webp", ".gif", ".pt", ".npz"}
+"""Suffixes of what commands write beside a report."""
+
+
 def check_report(path: str | None) -> None:
     """Fail before the job if its report could not be written.
 
@@ -78,7 +82,7 @@ def check_report(path: str | None) -> None:
         from lgrasp.files import check_file, check_kind
 
         check_file(path)
-        if Path(path).suffix.lower() not in ("", ".json") or Path(path).name == "manifest.json":
+        if Path(path).suffix.lower() in _OTHER_KINDS or Path(path).name == "manifest.json":
             raise OutputError(f"--json {path}: a report is JSON, and no manifest; name a file such as report.json")
         check_kind(path, "report in JSON", r'[\[{](?!\s*"format":\s*"lgrasp)')
 

@@ -123,7 +123,7 @@ def _more(options: list[str], tasks: int) -> dict[str, str]:
         name, sign, value = option.partition("=")
         if not re.fullmatch(r"[a-z][a-z-]*", name := name.removeprefix("--")):
             raise ConfigError(f"--sbatch '{option}': give a long name of sbatch, and its value, such as qos=high")
-        if name in _OWN and not (name == "array" and re.fullmatch(rf"0-{tasks - 1}%[1-9][0-9]*", value)):
+        if name in _OWN and not (name == "array" and re.fullmatch(rf"0-{tasks - 1}(%[1-9][0-9]*)?", value)):
             few = f"; array=0-{tasks - 1}%4 lets 4 run at a time" if name == "array" and tasks > 1 else ""
             raise ConfigError(f"--sbatch '{option}': give {_OWN[name]} instead{few}")
         found[name] = value if sign else ""
@@ -188,5 +188,5 @@ def _submit(script: str, logs: Path, name: str) -> tuple[str, Path]:
     try:
         write_file(path, script)
     except OutputError as error:
-        notice(f"job {job} is submitted, but {error}")
+        notice(f"job {job or '(number unknown)'} is submitted, but {error}")
     return job, path

@@ -1,9 +1,9 @@
 """Rows of shards as scenes to look at, read as they are asked for; pictures of them."""
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
@@ -20,6 +20,7 @@ from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 from lgrasp.notices import notice
 from lgrasp.runtime.cores import cores
+from lgrasp.words import plural
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -50,11 +51,12 @@ class SceneRows:
     def __init__(self, paths: Paths) -> None:
         found = sound_files(paths, _count)
         self.files = [file for file, _, _ in found]
-        self._ends = list(accumulate(rows for _, _, rows in found))
+        self._lengths = {file: rows for file, _, rows in found}
+        self._ends = list(accumulate(self._lengths.values()))
         if not len(self):
             raise ShardError(f"{self.files[0]}: no row to look at (shards: {len(self.files)})")
         self._contents = lru_cache(_KEPT)(_contents)
-        self._row = lru_cache(_KEPT)(_row)
+        self._row = lru_cache(_KEPT)(self._read_row)
         self._chosen = lru_cache(1)(lambda where, _: self.chosen(where))
         self._shapes: dict[tuple[str, tuple[str, ...]], HandShape] = {}
 
@@ -71,6 +73,23 @@ class SceneRows:
             raise ConfigError(f"row {row} does not exist; there are 0 to {len(self) - 1}")
         file = bisect_right(self._ends, row)
         return self.files[file], row - ([0, *self._ends][file])
+
+    @contextmanager
+    def _opened(self, path: Path) -> Iterator[ShardReader]:
+        """A shard, which must have as many rows as when these were counted.
+
+        Raises:
+            ShardError: It is damaged, or another one is in its place.
+        """
+        with ShardReader(path) as reader:
+            if len(reader) != (rows := self._lengths[path]):
+                now = plural(len(reader), "row")
+                raise ShardError(f"{path} was replaced: it has {now} in place of {rows:,}; open it again")
+            yield reader
+
+    def _read_row(self, path: Path, number: int, _: int) -> GraspRows:
+        with self._opened(path) as reader:
+            return reader.rows(number, number + 1)
 
     def spread(self, count: int) -> list[int]:
         """So many rows evenly over all grasps, or all of these if there are fewer."""
@@ -155,7 +174,7 @@ class SceneRows:
         """
         parts = []
         for path in self.files:
-            with ShardReader(path) as reader:
+            with self._opened(path) as reader:
                 parts.append(reader.column(name).astype(np.float64))
         return np.concatenate(parts)
 
@@ -167,7 +186,7 @@ class SceneRows:
         """
         good = []
         for path in self.files:
-            with ShardReader(path) as reader:
+            with self._opened(path) as reader:
                 good.append(satisfied(reader, where))
         return np.flatnonzero(np.concatenate(good))
 
@@ -189,7 +208,7 @@ class SceneRows:
     def numbers(self, row: int) -> dict[str, float | list[float]]:
         """Metrics and verdicts of a row by column."""
         path, number = self.place(row)
-        with ShardReader(path) as reader:
+        with self._opened(path) as reader:
             names = [name for name in reader.columns if name.startswith(("metrics/", "physics/"))]
             return {name: reader.column(name, number, number + 1)[0].tolist() for name in names}
 
@@ -278,13 +297,6 @@ def _count(path: Path) -> int:
     """Rows of a shard that can be looked at."""
     with ShardReader(path) as reader:
         return len(satisfied(reader, ()))
-
-
-def _row(path: Path, number: int, _: int) -> GraspRows:
-    with ShardReader(path) as reader:
-        if number >= len(reader):
-            raise ShardError(f"{path} was replaced: it has {len(reader):,} rows, and no row {number:,}; open it again")
-        return reader.rows(number, number + 1)
 
 
 def _contents(path: Path, _: int) -> _Contents:

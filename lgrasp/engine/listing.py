@@ -184,10 +184,13 @@ def _record(
     """Take up files of a run; one that was replaced since its SHA-256 was made (its time is another) as it is now.
 
     Args:
-        every: all that is asked of the run in the folder, again in case that its manifest was removed.
+        every: all that is asked of the run in the folder, in case that the manifest was removed.
     """
-    known = {shard.file for shard in manifest.shards}
-    now = [shard for shard in every if shard.file not in known]
+    if all(known.run_key != run.run_key for known in manifest.runs):
+        others = {shard.file for known in manifest.runs if known.run_key for shard in known.shards}
+        asked = [shard for shard in every if shard.file not in others]
+        manifest.ask(run.model_copy(update={"shards": asked}), making=(), busy={})
+    now = []
     for shard, time_ns in shards:
         changed = shard.sha256 and _time(folder / shard.file) not in (0, time_ns)
         now.append(listed(shard, folder / shard.file, shard.rows or 0) if changed else shard)

@@ -289,11 +289,11 @@ def prepare(job: Job, todo: "Todo") -> float:
     """Load the inputs and kernels of a job that :func:`look` saw; seconds that the kernels took."""
     missing = [part for part in todo.parts if part.number not in todo.present]
     begin = time.perf_counter()
-    if missing:
+    if missing and job.kernels:
         job.import_kernels()
-    if missing and job.kernels and (words := first_time(todo.device.alias)):
-        job.events.said(words)
-        load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading, preparing=True)
+        if words := first_time(todo.device.alias):
+            job.events.said(words)
+            load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading, preparing=True)
     kernels = time.perf_counter() - begin
     job.load(job.events, bool(missing))
     begin = time.perf_counter()

@@ -7,11 +7,13 @@ from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from lgrasp.dataset.manifest import TEMPORARY
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import Events, JobOutcome, Made, Part
 from lgrasp.engine.request import Request
 from lgrasp.engine.run import Job, look, own_parts, prepare, run
 from lgrasp.errors import DeviceError, LgraspError
+from lgrasp.files import remove_leftovers
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.device import Device, resolve_device
 from lgrasp.runtime.processes import Crew, Link
@@ -35,7 +37,8 @@ class Lanes(ExitStack):
     ) -> None:
         super().__init__()
         self._devices, self._jobs, self._arrays, self._cache, self._resume = devices, jobs, arrays, cache, resume
-        self._ends: dict[int, list[JobOutcome | Exception]] = defaultdict(list)  # of each job, those of lanes
+        self._ends: dict[int, dict[int, JobOutcome | Exception]] = defaultdict(dict)  # of each job, those of lanes
+        self._lost: dict[int, DeviceError] = {}  # lanes that were killed
         self._told: dict[int, dict[int, _Far]] = defaultdict(dict)  # of each job, the latest of each part
         self._crew: Crew | None = None
 
@@ -62,18 +65,21 @@ class Lanes(ExitStack):
             self._wait(crew, number, events)
             if not first:
                 job.load(events, False)
-        except DeviceError:  # of a lane that ended; the next job starts them again
+        except DeviceError:  # of a lane that was killed; the next job starts them again
             self.close()
             self._crew = None
-            self._ends.clear()
-            self._told.clear()
+            for of_lanes in (self._ends, self._told, self._lost):
+                of_lanes.clear()
+            job.clean(todo.parts)
+            for folder in {job.folder, *(part.file.parent for part in todo.parts)}:
+                remove_leftovers(folder, TEMPORARY)
             raise
         finally:
             job.close()
         outcome.cancelled = len(self._ends[number]) < len(self._devices)  # lanes that were stopped before they began
         names = list(dict.fromkeys(device.name for device in self._devices))
         outcome.device = replace(todo.device, name=f"{len(self._devices)} x {', '.join(names)}")
-        for end in self._ends[number]:
+        for end in self._ends[number].values():
             if isinstance(end, Exception):
                 raise end
             outcome.on_disk |= end.on_disk
@@ -95,12 +101,23 @@ class Lanes(ExitStack):
         return Crew(_make_share, tasks, [f"{d.alias} (lane {n} of {count})" for n, d in enumerate(self._devices, 1)])
 
     def _wait(self, crew: Crew, number: int, events: Events) -> None:
-        """Until all lanes are done with a job, one failed, or all have ended."""
+        """Until all lanes are done with a job, one failed, or all have ended.
+
+        Raises:
+            DeviceError: one was killed before it was done.
+        """
         for far in self._told.pop(number, {}).values():
             far.tell(events)
         ends = self._ends[number]
-        while crew.working and len(ends) < len(self._devices) and not any(isinstance(end, Exception) for end in ends):
-            for _, (at, message) in crew.heard(0.1):
+        while not (killed := [error for lane, error in self._lost.items() if lane not in ends]):
+            failed = any(isinstance(end, Exception) for end in ends.values())
+            if failed or len(ends) == len(self._devices) or not crew.working:
+                return
+            for lane, said in crew.heard(0.1):
+                if isinstance(said, DeviceError):
+                    self._lost[lane] = said
+                    continue
+                at, message = said
                 if isinstance(message, _Far):
                     if at == number:
                         message.tell(events)
@@ -108,9 +125,10 @@ class Lanes(ExitStack):
                 elif isinstance(message, str):
                     self._cache.warn(message)
                 else:
-                    self._ends[at].append(message)
+                    self._ends[at][lane] = message
             if events.cancelled():
                 crew.stop()
+        raise killed[0]
 
 
 class _Far(NamedTuple):

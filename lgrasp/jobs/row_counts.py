@@ -39,12 +39,12 @@ def count_made(rows: GraspRows, config: Mapping[str, Any], moving: np.ndarray) -
 
 
 def count_written(
-    paths: Collection[Path], made: Collection[Path], moving: np.ndarray, device: str
+    paths: Collection[Path], counted: Collection[Path], moving: np.ndarray, device: str
 ) -> tuple[Counter[str], dict[str, dict[str, int]], int]:
     """Counts of a folder's shards, each opened once.
 
     Args:
-        made: those that are counted already, by :func:`count_made`.
+        counted: those that are counted already, by :func:`count_made`.
         moving: as there.
         device: that looks for near-duplicates.
 
@@ -59,10 +59,10 @@ def count_written(
     counts: dict[str, dict[str, int]] = {}
     poses, postures, compared = [], [], 0
     for path in paths:
-        if path in made and compared >= _MOST_COMPARED:
+        if path in counted and compared >= _MOST_COMPARED:
             continue
         with ShardReader(path, invalid=False) as reader:
-            if path not in made:
+            if path not in counted:
                 whole.update(_count(reader.column, reader.columns, reader.header.config, moving))
                 whole["negatives"] += int(reader.statistics.get("negatives", 0))
                 add_counts(counts, stage_counts(reader.statistics))

@@ -1,6 +1,7 @@
 """Which files are judged; light to import, so that a missing one is told at once."""
 
 import os
+import re
 import tempfile
 import uuid
 from collections.abc import Sequence
@@ -68,13 +69,23 @@ def check_report(path: str) -> None:
         raise JudgeError(f"file {path} cannot be written: it is a folder; name a file")
     if _is_special(path):
         return
-    if Path(path).suffix.lower() not in ("", ".json") or Path(path).name == "manifest.json":
-        raise JudgeError(f"file {path} cannot be written: findings are JSON; name a file such as findings.json")
+    if not _may_be_replaced(path):
+        raise JudgeError(f"file {path} is there and holds no findings; it stays: name another")
     nearest = next(folder for folder in Path(os.path.realpath(path)).parents if folder.exists())
     try:
         tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:
         raise JudgeError(f"file {path} cannot be written: {nearest}: {error.strerror}; name another") from error
+
+
+def _may_be_replaced(path: str) -> bool:
+    """Whether there is no file, an empty one, or one in JSON that is none of lgrasp's own kinds."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(512).removeprefix(b"\xef\xbb\xbf").lstrip()
+    except OSError:  # told by what follows
+        return True
+    return not head or bool(re.match(rb'[\[{](?!\s*"format":\s*"lgrasp)', head))
 
 
 def write_report(path: str, text: str) -> None:

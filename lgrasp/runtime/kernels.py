@@ -59,14 +59,17 @@ def load_kernels(
     *,
     preparing: bool = False,
 ) -> None:
-    """Compile and load modules for one device, several at a time; elsewhere than so far if the disk has become full.
+    """Compile and load modules, several at a time; elsewhere than so far if the disk has become full.
 
     Args:
-        device: ``cpu`` or ``cuda:N``.
+        device: for which: ``cpu`` or ``cuda:N``.
         progress: called with (module that is ready, share done).
         preparing: also :data:`PREPARING` for the CPU, beside the others.
     """
-    devices = {importlib.import_module(name).__name__: ["cpu"] for name in (PREPARING if preparing else ())}
+    devices: dict[str, list[str]] = {}
+    for name in PREPARING if preparing else ():
+        importlib.import_module(name)
+        devices[name] = ["cpu"]
     for name in modules:
         devices.setdefault(name, []).append(device)
 

@@ -93,11 +93,8 @@ class Crew:
                 link.send(None)
 
     def heard(self, seconds: float) -> list[tuple[int, Any]]:
-        """What processes sent, with their numbers, once there is something or the time is over.
-
-        Raises:
-            DeviceError: one ended otherwise than by returning.
-        """
+        """What processes sent, with their numbers, once there is something or the time is over; a DeviceError, the
+        last of one that ended otherwise than by returning."""
         links = {link: number for number, link in enumerate(self._links) if number not in self._ended}
         found = []
         for link in wait(list(links), seconds) if links else ():
@@ -110,7 +107,7 @@ class Crew:
                 if code := self._processes[number].exitcode:
                     how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
                     name = self._names[number]
-                    raise DeviceError(f"the process on {name} ended {how}; the same command goes on") from None
+                    found.append((number, DeviceError(f"the process on {name} ended {how}; the same command goes on")))
         return found
 
 

@@ -63,8 +63,13 @@ def test_files_that_change_while_they_are_looked_at(folder):
     rows = SceneRows(folder)
     assert rows.read(2)[0].name == rows.read(0)[0].name
     write_shard(folder / "a" / "a.h5", jaw_shard(folder / "urdf", jaw_rows(0.002, count=1)))
-    with pytest.raises(ShardError, match=r"a\.h5 was replaced: it has 1 rows, and no row 2; open it again"):
+    with pytest.raises(ShardError, match=r"a\.h5 was replaced: it has 1 row in place of 3; open it again"):
         rows.scene(2)
+    assert rows.read(4)
+    name = rows.columns()[0]
+    for ask in (lambda: rows.column(name), lambda: rows.meeting(f"{name} >= 0"), lambda: rows.numbers(0)):
+        with pytest.raises(ShardError, match=r"a\.h5 was replaced"):
+            ask()
     (folder / "a" / "a.h5").unlink()
     assert rows.caption(4, [0, 4]) == "row 4"
     with pytest.raises(ShardError, match=r"a\.h5"):

@@ -76,12 +76,33 @@ def test_a_manifest_that_was_removed_meanwhile_lists_again_what_is_asked(tmp_pat
     class Removing(SampleJob):
         def make(self, part, progress):
             if part.number == 1:
+                while entries(self.out)[0] == (2, None):
+                    time.sleep(0.01)
                 (self.out / "manifest.json").unlink()
             return super().make(part, progress)
 
     run(Removing(out=tmp_path), StopAfter(2))
     assert entries(tmp_path) == [(2, 2), (2, 2), (2, None)]
+    assert len(document(tmp_path)["runs"]) == 1
     assert differences(tmp_path).missing == ["toy-cup-00002.h5"]
+
+
+def test_what_another_task_has_dropped_stays_dropped(tmp_path):
+    """An input is found damaged by the task that has it, which begins while another works."""
+
+    class Losing(SampleJob):
+        def whole(self, parts, *, some):
+            return [part for part in parts if part.number != 2]
+
+    class First(Losing):
+        def make(self, part, progress):
+            if part.number == 1:
+                run(Losing(out=self.out, rows=8), array=(0, 2))
+            return super().make(part, progress)
+
+    run(First(out=tmp_path, rows=8), array=(1, 2))
+    assert differences(tmp_path).missing == []
+    assert entries(tmp_path) == [(2, 2)] * 3
 
 
 def test_of_two_runs_side_by_side_each_file_is_listed_as_it_is(tmp_path):

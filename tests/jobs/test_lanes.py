@@ -33,6 +33,14 @@ class SlowJob(SampleJob):
         return super().make(part, progress)
 
 
+class HalfSlowJob(SampleJob):
+    """One lane's parts take longer than all that the other has to do."""
+
+    def make(self, part, progress):
+        time.sleep(part.number % 2)
+        return super().make(part, progress)
+
+
 class DyingJob(SampleJob):
     """Its third part is the end of the process that makes it."""
 
@@ -89,11 +97,14 @@ def test_lanes_share_the_files_of_jobs(tmp_path):
 
 
 def test_a_lane_that_is_killed_fails_its_job_alone(tmp_path):
-    jobs = [kind(out=tmp_path / kind.__name__, rows=10, device="cpu") for kind in (DyingJob, SlowJob)]
+    """Not the one before, of which it has made its share, nor those after."""
+    kinds = (HalfSlowJob, DyingJob, SlowJob)
+    jobs = [kind(out=tmp_path / kind.__name__, rows=10, device="cpu") for kind in kinds]
     cache = Cache(tmp_path / "cache")
-    with Lanes(resolve_devices("cpu,cpu"), jobs, [Array()] * 2, cache, resume=True) as lanes:
+    with Lanes(resolve_devices("cpu,cpu"), jobs, [Array()] * 3, cache, resume=True) as lanes:
+        assert lanes.outcome(0, jobs[0], Events()).rows == 10
         with pytest.raises(DeviceError, match=r"on cpu \(lane 1 of 2\) ended by signal 9; the same command"):
-            lanes.outcome(0, jobs[0], Events())
-        made = lanes.outcome(1, jobs[1], Events())
+            lanes.outcome(1, jobs[1], Events())
+        made = lanes.outcome(2, jobs[2], Events())
         assert (made.rows, made.cancelled) == (10, False)
     assert not list(tmp_path.rglob("*.tmp"))

@@ -42,7 +42,7 @@ def report_dataset(paths: Paths, out: Path, *, progress: Callable[[int, int], No
     """
     if out.exists() and not out.is_file():
         raise OutputError(f"report {out} cannot be written: it is no regular file; name another")
-    check_kind(out, "HTML page", "<!doctype html")
+    check_kind(out, "HTML page", r"(<!--.*?-->\s*)?<(!doctype )?html")
     heads, remarks = survey(paths)
     numbers, hands = _read(heads, remarks, progress, near=True)
     write_file(out, page(numbers, hands, pictures(sorted(head.path for head in heads)) if numbers["rows"] else ()))
