@@ -49,9 +49,10 @@ class SceneRows:
     """
 
     def __init__(self, paths: Paths) -> None:
-        found = sound_files(paths, _count)
+        found = sound_files(paths, _grasps)
         self.files = [file for file, _, _ in found]
-        self._lengths = {file: rows for file, _, rows in found}
+        self._lengths = {file: len(grasps) for file, _, grasps in found}
+        self._grasps = [grasps for _, _, grasps in found]
         self._ends = list(accumulate(self._lengths.values()))
         if not len(self):
             raise ShardError(f"{self.files[0]}: no row to look at (shards: {len(self.files)})")
@@ -184,6 +185,8 @@ class SceneRows:
         Raises:
             ShardError: A shard lacks a column.
         """
+        if not where:
+            return np.flatnonzero(np.concatenate(self._grasps))
         good = []
         for path in self.files:
             with self._opened(path) as reader:
@@ -293,10 +296,10 @@ def _when(path: Path) -> int:
     return path.stat().st_mtime_ns if path.exists() else 0
 
 
-def _count(path: Path) -> int:
-    """Rows of a shard that can be looked at."""
+def _grasps(path: Path) -> np.ndarray:
+    """Which rows of a shard are grasps, (N,) bool."""
     with ShardReader(path) as reader:
-        return len(satisfied(reader, ()))
+        return satisfied(reader, ())
 
 
 def _contents(path: Path, _: int) -> _Contents:
