@@ -162,9 +162,9 @@ def find_yaml(name: str, files: Mapping[str, Path], what: str) -> Path:
         ConfigError: neither.
     """
     path = files.get(name) or user_path(name)
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise ConfigError(f"{what} {path} is no regular file; give the path of a YAML file")
     if not os.path.isfile(path):
+        if os.path.exists(path):
+            raise ConfigError(f"{what} {path} is no regular file; give the path of a YAML file")
         hint, known = did_you_mean(path.stem, files), ", ".join(files) or "none"
         raise ConfigError(f"unknown {what} '{name}'; {hint}known: {known}, or give the path of a YAML file")
     return path

@@ -50,10 +50,9 @@ class SceneRows:
 
     def __init__(self, paths: Paths) -> None:
         found = sound_files(paths, _grasps)
-        self.files = [file for file, _, _ in found]
-        self._lengths = {file: len(grasps) for file, _, grasps in found}
-        self._grasps = [grasps for _, _, grasps in found]
-        self._ends = list(accumulate(self._lengths.values()))
+        self._grasps = {file: grasps for file, _, grasps in found}
+        self.files = list(self._grasps)
+        self._ends = list(accumulate(map(len, self._grasps.values())))
         if not len(self):
             raise ShardError(f"{self.files[0]}: no row to look at (shards: {len(self.files)})")
         self._contents = lru_cache(_KEPT)(_contents)
@@ -83,7 +82,7 @@ class SceneRows:
             ShardError: It is damaged, or another one is in its place.
         """
         with ShardReader(path) as reader:
-            if len(reader) != (rows := self._lengths[path]):
+            if len(reader) != (rows := len(self._grasps[path])):
                 now = plural(len(reader), "row")
                 raise ShardError(f"{path} was replaced: it has {now} in place of {rows:,}; open it again")
             yield reader
@@ -186,7 +185,7 @@ class SceneRows:
             ShardError: A shard lacks a column.
         """
         if not where:
-            return np.flatnonzero(np.concatenate(self._grasps))
+            return np.flatnonzero(np.concatenate(list(self._grasps.values())))
         good = []
         for path in self.files:
             with self._opened(path) as reader:

@@ -109,7 +109,9 @@ class Lanes(ExitStack):
         for far in self._told.pop(number, {}).values():
             far.tell(events)
         ends = self._ends[number]
-        while not (killed := [error for lane, error in self._lost.items() if lane not in ends]):
+        while True:
+            if killed := self._lost.keys() - ends.keys():
+                raise self._lost[min(killed)]
             failed = any(isinstance(end, Exception) for end in ends.values())
             if failed or len(ends) == len(self._devices) or not crew.working:
                 return
@@ -128,7 +130,6 @@ class Lanes(ExitStack):
                     self._ends[at][lane] = message
             if events.cancelled():
                 crew.stop()
-        raise killed[0]
 
 
 class _Far(NamedTuple):
