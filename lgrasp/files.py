@@ -24,7 +24,6 @@ try:
 except ImportError:  # Windows: leftovers cannot be distinguished from files being written
     fcntl = None
 
-_HEAD = 512  # bytes by which the kind of a file is known
 _LONGEST_NAME = 255  # bytes, of a file
 _TEMPORARY = re.compile(r"\.([0-9a-f]{6})[0-9a-f]{6}-[0-9a-f]{12}\b")  # the computer in a temporary file's name
 FOREIGN_AGE = 86_400.0
@@ -62,66 +61,13 @@ def new_file(path: str | os.PathLike[str], *, flush: bool = True) -> Iterator[IO
             _remove_left(path)
 
 
-def check_folder(out: Path) -> None:
-    """Check that files can be written into a folder, without creating it (the first shard does).
-
-    Raises:
-        OutputError: a file is in the way, or the nearest existing folder is read-only.
-    """
-    nearest = next(p for p in (out, *out.absolute().parents) if os.path.lexists(p))
-    if not nearest.is_dir():
-        what = "is a file" if nearest.exists() else "leads nowhere"
-        raise OutputError(f"output folder {out} cannot be made: {nearest} {what}; choose another with --out")
-    try:
-        tempfile.TemporaryFile(dir=nearest).close()
-    except OSError as error:
-        why = error.strerror
-        raise OutputError(f"output folder {out} cannot be written: {why}; choose another with --out") from None
-
-
-def check_file(path: str | os.PathLike[str]) -> None:
-    """Check, before a long job, that a file can be written there.
-
-    Raises:
-        OutputError: it is a folder, or its folder cannot be written.
-    """
-    path = Path(path)
-    if path.is_dir():
-        raise OutputError(f"file {path} cannot be written: it is a folder; name a file")
-    if _is_special(path):
-        return
-    try:
-        check_folder(path.parent)
-    except OutputError as error:
-        raise OutputError(f"file {path}: {str(error).replace('choose another with --out', 'name another')}") from None
-
-
-def check_kind(path: str | os.PathLike[str], what: str, begins: str) -> None:
-    """Check that a file which is to be replaced, if there is one, is of the kind that is written there.
-
-    Args:
-        what: the kind, for the message.
-        begins: pattern of its first characters.
-
-    Raises:
-        OutputError: it is of another kind, or cannot be read.
-    """
-    path = Path(path)
-    if not path.is_file():
-        return
-    with writing(path), open(path, "rb") as file:
-        head = file.read(_HEAD).removeprefix(b"\xef\xbb\xbf").lstrip()
-    if head and not re.match(begins.encode(), head, re.IGNORECASE):
-        raise OutputError(f"file {path} is there and is no {what}; it stays: name another")
-
-
 def write_file(path: str | os.PathLike[str], data: bytes | str, *, flush: bool = True) -> None:
     """Write a whole file; text is UTF-8. Arguments and errors as of :func:`new_file`.
 
     A pipe or device such as /dev/stdout is written to, not replaced by a file.
     """
     data = data.encode() if isinstance(data, str) else data
-    if _is_special(Path(path)):
+    if is_special(Path(path)):
         with writing(Path(path)), open(path, "wb") as file:
             file.write(data)
         return
@@ -129,7 +75,7 @@ def write_file(path: str | os.PathLike[str], data: bytes | str, *, flush: bool =
         file.write(data)
 
 
-def _is_special(path: Path) -> bool:
+def is_special(path: Path) -> bool:
     """Something that exists and is no regular file: it must not be replaced by one."""
     return path.exists() and not path.is_file()
 

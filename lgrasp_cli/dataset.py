@@ -143,7 +143,7 @@ def report(
 
     Example: lgrasp dataset report grasps --out report.html --json report.json
     """
-    from lgrasp.files import check_file
+    from lgrasp.outputs import check_file
 
     check_file(out)
     from lgrasp.dataset.report.write import report_dataset

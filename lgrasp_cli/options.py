@@ -79,7 +79,7 @@ def check_report(path: str | None) -> None:
     """
     if path and path != "-":
         from lgrasp.errors import OutputError
-        from lgrasp.files import check_file, check_kind
+        from lgrasp.outputs import check_file, check_kind
 
         check_file(path)
         if Path(path).suffix.lower() in _OTHER_KINDS or Path(path).name == "manifest.json":

@@ -67,10 +67,9 @@ def submit(
     name = name or f"lgrasp-{words[0]}"
     if not re.fullmatch(r"[\w.+-]+", name):
         raise ConfigError(f"--name '{name}' may hold letters, digits and '.', '_', '+', '-' only")
-    pattern = "%x-%A_%a.log" if tasks > 1 else "%x-%j.log"
     options = {
         "job-name": name,
-        "output": str(logs.absolute()).replace("%", "%%") + f"/{pattern}",
+        "output": str(logs.absolute()).replace("%", "%%") + ("/%x-%A_%a.log" if tasks > 1 else "/%x-%j.log"),
         "open-mode": "append",  # of a task that is requeued
         "array": f"0-{tasks - 1}" if tasks > 1 else None,
         "gres": f"gpu:{gpus}" if gpus else None,
@@ -87,7 +86,7 @@ def submit(
         typer.echo(script)
         raise ConfigError("there is no sbatch here: nothing was submitted; this is the script")
     job, path = _submit(script, logs, name)
-    log = re.sub("%[xAja]", lambda sign: {"%x": name, "%a": "TASK"}.get(sign[0], job or "JOB"), pattern)
+    log = f"{name}-{job or 'JOB'}_TASK.log" if tasks > 1 else f"{name}-{job or 'JOB'}.log"
     pairs = [
         ("job", f"{job or 'number unknown'}: {plural(tasks, 'task')}, {plural(parts, 'file')}"),
         ("script", str(path)),
@@ -154,13 +153,11 @@ def _script(options: dict[str, str], words: list[str]) -> str:
 def _submit(script: str, logs: Path, name: str) -> tuple[str, Path]:
     """Number of the submitted job, "" if sbatch tells none, and the script's file."""
     from lgrasp.errors import ConfigError, OutputError
-    from lgrasp.files import check_folder, write_file
+    from lgrasp.files import write_file
     from lgrasp.notices import notice
+    from lgrasp.outputs import check_folder
 
-    try:
-        check_folder(logs)
-    except OutputError as error:
-        raise ConfigError(str(error).replace("--out", "--logs")) from None
+    check_folder(logs, instead="choose another with --logs")
     logs.mkdir(parents=True, exist_ok=True)  # SLURM makes none
     own = {key: value for key, value in os.environ.items() if key != "TMPDIR"}  # which goes with this process
     try:

@@ -53,7 +53,7 @@ def merely_checked(requests: "Sequence[Request]", cache: "Cache") -> bool:
     if found is None:
         return False
     from lgrasp.engine.run import Job
-    from lgrasp.files import check_folder
+    from lgrasp.outputs import check_folder
 
     for request in requests:
         request.check()

@@ -15,7 +15,7 @@ from support.sources import parse
 DATA = ("hands", "objects", "pipelines", "configs", "models")
 
 ORDER = (
-    ("errors", "files", "paths", "notices", "choices", "config", "seeding", "signals", "words"),
+    ("errors", "files", "outputs", "paths", "notices", "choices", "config", "seeding", "signals", "words"),
     ("geometry", "math", "runtime"),
     ("hand", "object"),
     ("cloud", "differentiable", "field"),

@@ -8,7 +8,8 @@ from typing import ClassVar, Self
 
 from lgrasp.config import Params, parse_model
 from lgrasp.errors import ConfigError
-from lgrasp.files import check_file, check_kind, write_file
+from lgrasp.files import write_file
+from lgrasp.outputs import check_file, check_kind
 
 
 class JsonFile(Params):

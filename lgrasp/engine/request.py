@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 
 from lgrasp.config import DeviceName, Params, ShardPaths, Workers
 from lgrasp.dataset.files import shards_below
-from lgrasp.files import check_folder
+from lgrasp.outputs import check_folder
 
 if TYPE_CHECKING:
     from lgrasp.engine.cache import Cache

@@ -22,8 +22,8 @@ from lgrasp.engine.folder import Found, clean_folder, found_shard, neighbours
 from lgrasp.engine.listing import Listing, Renewing, begun_array, entries
 from lgrasp.engine.request import Request
 from lgrasp.errors import LgraspError, OutputError, ShardError
-from lgrasp.files import check_folder
 from lgrasp.notices import notice
+from lgrasp.outputs import check_folder
 from lgrasp.runtime.array import Array
 from lgrasp.runtime.cores import threads
 from lgrasp.runtime.device import Device, resolve_device

@@ -6,8 +6,9 @@ from typing import Any, get_args
 
 from lgrasp.choices import ShapeKind
 from lgrasp.errors import ConfigError, OutputError
-from lgrasp.files import check_folder, write_file
+from lgrasp.files import write_file
 from lgrasp.object.params import ObjectParams
+from lgrasp.outputs import check_folder
 from lgrasp.sequence.size import Size, parse_size
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lgrasp.errors import OutputError
-from lgrasp.files import check_file, write_file
+from lgrasp.files import write_file
+from lgrasp.outputs import check_file
 
 if TYPE_CHECKING:  # slow to import
     from matplotlib.figure import Figure

@@ -19,7 +19,8 @@ from lgrasp.dataset.report.tables import Block
 from lgrasp.dataset.report.verdicts import held_numbers
 from lgrasp.dataset.scenes import SceneRows, draw_rows
 from lgrasp.errors import LgraspError, OutputError
-from lgrasp.files import check_kind, write_file
+from lgrasp.files import write_file
+from lgrasp.outputs import check_kind
 from lgrasp.picture.sheet import image_bytes
 from lgrasp.runtime.device import resolve_device
 

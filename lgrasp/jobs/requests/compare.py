@@ -13,9 +13,9 @@ from lgrasp.config import HandNames, OtherSeed, did_you_mean
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
-from lgrasp.files import check_folder
 from lgrasp.hand.names import all_hands, hand_path
 from lgrasp.object.find import all_objects, find_object
+from lgrasp.outputs import check_folder
 
 _LEAST, _MOST = 0.2, 5.0  # factors that are accepted
 

@@ -9,10 +9,10 @@ from lgrasp.config import HandName, MeshScale
 from lgrasp.engine.pipeline import NamedPipeline, load_pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
-from lgrasp.files import check_file
 from lgrasp.hand.names import hand_path
 from lgrasp.learn.params import PosePolicyParams
 from lgrasp.object.find import find_object
+from lgrasp.outputs import check_file
 
 
 class PolicyRequest(Request):

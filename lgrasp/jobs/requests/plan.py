@@ -10,11 +10,11 @@ from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
 from lgrasp.config import Viewpoint, apply_settings, parse_model
 from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
-from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.jobs.requests.shards import look_up
 from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
+from lgrasp.outputs import check_folder
 from lgrasp.paths import check_input
 from lgrasp.planning.params import PlanParams
 

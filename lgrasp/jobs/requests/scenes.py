@@ -11,9 +11,9 @@ from lgrasp.engine.folder import check_number
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import ConfigError
-from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path
 from lgrasp.object.find import find_object
+from lgrasp.outputs import check_folder
 from lgrasp.paths import as_on_disk
 from lgrasp.scenes.params import SceneParams
 

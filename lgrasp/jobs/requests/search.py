@@ -14,10 +14,10 @@ from lgrasp.engine.folder import check_number, run_folder
 from lgrasp.engine.pipeline import NamedPipeline, Pipeline
 from lgrasp.engine.request import Request
 from lgrasp.errors import CloudError, ConfigError
-from lgrasp.files import check_folder
 from lgrasp.hand.names import hand_path, known_hands
 from lgrasp.learn.networks import check_network, with_network_hand
 from lgrasp.object.find import find_object
+from lgrasp.outputs import check_folder
 from lgrasp.paths import check_input
 from lgrasp.sequence.size import parse_size
 from lgrasp.simulate.protocol import NO_TABLE, PROTOCOLS, find_protocol

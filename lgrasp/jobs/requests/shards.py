@@ -13,13 +13,13 @@ from lgrasp.dataset.exports.options import check_options
 from lgrasp.dataset.files import find_shards, shards_below
 from lgrasp.engine.request import Request, ShardRequest
 from lgrasp.errors import ConfigError, HandError, OutputError, ShardError
-from lgrasp.files import check_file, check_folder
 from lgrasp.grasp.bounds import GraspBounds
 from lgrasp.hand.names import hand_path
 from lgrasp.hold.params import HoldTest
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.params import LearnParams
+from lgrasp.outputs import check_file, check_folder
 from lgrasp.paths import check_input, user_path
 from lgrasp.reach.placement import ORIGIN, Placement
 from lgrasp.refine.params import COARSE, LocalSearch
