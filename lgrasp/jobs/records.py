@@ -1,6 +1,6 @@
 """Hand and object of a job as the records of a shard, and as the scene of a simulator."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,12 +73,18 @@ def object_record(
     )
 
 
-def cutter(cache: Cache, events: Events | None = None, progress: PartProgress | None = None) -> Decompose:
+def cutter(
+    cache: Cache,
+    events: Events | None = None,
+    progress: PartProgress | None = None,
+    cutting: Callable[[], None] | None = None,
+) -> Decompose:
     """:func:`decompose` with a cache.
 
     Args:
         events: told whose mesh is being cut.
         progress: of the part that needs it, which ends if the job is to stop.
+        cutting: called again and again while a mesh is cut.
     """
 
     def tell(what: str) -> None:
@@ -86,6 +92,8 @@ def cutter(cache: Cache, events: Events | None = None, progress: PartProgress | 
             events.loading(f"convex pieces of {what}")
         if progress:
             progress.check()
+        if cutting:
+            cutting()
 
     return partial(decompose, store=cache, tell=tell)
 

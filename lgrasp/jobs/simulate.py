@@ -1,8 +1,11 @@
 """Simulates the rows of shards and adds the verdicts to them, or to copies."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +17,7 @@ from lgrasp.dataset.reader import ShardReader, count_rows
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import rows_digest
-from lgrasp.errors import PhysicsError, ShardError
+from lgrasp.errors import LgraspError, PhysicsError, ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.jobs.records import cutter
 from lgrasp.jobs.requests.shards import SimulateRequest
@@ -26,7 +29,7 @@ from lgrasp.runtime.kept import Keeper
 from lgrasp.simulate.engines import SOLVERS
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.protocol import NO_TABLE, Protocol
-from lgrasp.simulate.run import check_installed, on_cpu, protocol_text, verdicts
+from lgrasp.simulate.run import check_installed, load_world_kernels, on_cpu, protocol_text, verdicts
 from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, LIFT_COLUMNS, OBJECT_COLUMNS
@@ -93,7 +96,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
         workers = threads(self.workers)
         with ShardReader(part.source) as reader:
             hand, objects, rows = reader.hand(), reader.objects(), len(reader)
-            scene = self._scene_of(hand, objects, progress)
+            ahead = partial(load_world_kernels, hand, objects, reader.rows(0, min(rows, 1)), protocol, device)
+            scene = self._scene_of(hand, objects, progress, None if self._kind() == "cpu" else ahead)
             key = self.key_of(reader)
             kept = KeptVerdicts(self.cache, key, name, largest=_GPU_BLOCK if self._kind() == "gpu" else None)
 
@@ -176,14 +180,35 @@ class SimulateJob(SimulateRequest, VerdictJob):
         return "cpu" if on_cpu(self.device_used.alias, self.protocol) else "gpu"
 
     def _scene_of(
-        self, hand: HandRecord, objects: Sequence[ObjectRecord], progress: PartProgress | None = None
+        self,
+        hand: HandRecord,
+        objects: Sequence[ObjectRecord],
+        progress: PartProgress | None = None,
+        ahead: Callable[[], None] | None = None,
     ) -> Scene:
-        """What is simulated of a shard: hand and objects cut into convex pieces."""
+        """What is simulated of a shard: hand and objects cut into convex pieces.
+
+        Args:
+            ahead: done beside, if meshes are cut, which keeps one core busy.
+        """
         planes = [b"" if record.tables is None else record.tables.tobytes() for record in objects]
         key = (hand.sha256, *((o.id, mesh_hash(o), plane) for o, plane in zip(objects, planes, strict=True)))
 
         def make() -> Scene:
-            scene = scene_of(hand, objects, cutter(self.cache, self.events, progress))
+            begun: list[Future[None]] = []
+            pool = ThreadPoolExecutor(1)
+
+            def cutting() -> None:
+                if ahead and not begun:
+                    begun.append(pool.submit(ahead))
+
+            try:
+                scene = scene_of(hand, objects, cutter(self.cache, self.events, progress, cutting))
+                for future in begun:
+                    with suppress(LgraspError):  # who needs it meets it again
+                        future.result()
+            finally:
+                pool.shutdown(wait=False)  # who stops the job does not wait
             for line in (f"object {solid.name}: {note}" for solid in scene.objects for note in solid.notes):
                 if line not in self._said:
                     self._said.add(line)

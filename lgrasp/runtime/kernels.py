@@ -3,10 +3,13 @@
 import importlib
 import pkgutil
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from types import ModuleType
+from typing import Any
+from unittest import mock
 
 import warp as wp
 
@@ -87,3 +90,43 @@ def load_kernels(
             note_checksums(folder)
             if progress:
                 progress(f"kernels {waiting[future]}", done / len(waiting))
+
+
+_noting = threading.Lock()  # what replaces Warp's functions is there once at a time
+
+
+def load_launched(call: Callable[[], object], device: str) -> None:
+    """Compile and load, several at a time, the modules of the kernels that a call of a library launches; nothing runs.
+
+    Args:
+        call: launches on ``device``; what it does may not depend on what kernels find.
+    """
+    found: dict[wp.Module, set[int | None]] = {}
+    caller = threading.get_ident()
+
+    def instead(real: Callable[..., Any], result: Any = None) -> Callable[..., Any]:
+        def note(kernel: wp.Kernel, *args: Any, **options: Any) -> Any:
+            if threading.get_ident() != caller or kernel.is_generic:
+                return real(kernel, *args, **options)
+            found.setdefault(kernel.module, set()).add(options.get("block_dim"))
+            return result
+
+        return note
+
+    def both(condition: object, on_true: Any = None, on_false: Any = None, **options: Any) -> None:
+        for each in (on_true, on_false, options.pop("while_body", None)):
+            if callable(each):
+                each(**options)
+
+    with _noting:
+        noted: dict[str, Any] = {name: instead(getattr(wp, name)) for name in ("launch", "launch_tiled")}
+        noted["get_suggested_block_size"] = instead(wp.get_suggested_block_size, (256, 1))
+        with mock.patch.multiple(wp, **noted, capture_while=both, capture_if=both):
+            call()
+
+    def load(module: wp.Module) -> None:
+        for threads in found[module]:
+            wp.load_module(module, device, block_dim=threads)
+
+    with ThreadPoolExecutor(min(cores(), 8)) as pool:
+        list(pool.map(load, sorted(found, key=lambda module: -len(module.kernels))))

@@ -13,7 +13,7 @@ import numpy as np
 
 from lgrasp.errors import PhysicsError
 from lgrasp.geometry.poses import shifted
-from lgrasp.grasp.records import GraspRows
+from lgrasp.grasp.records import GraspRows, HandRecord, ObjectRecord
 from lgrasp.grasp.schema import POSTURES
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.runtime.processes import ProcessPool, none_killed
@@ -21,7 +21,7 @@ from lgrasp.simulate.engines import SOLVERS, check_engine, engine_text
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.model import Model, build_model
 from lgrasp.simulate.protocol import PROTOCOLS, Protocol
-from lgrasp.simulate.scene import Scene
+from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.trial import Trial
 from lgrasp.simulate.verdict import Verdict, chunk_of, stack_verdicts
@@ -189,6 +189,23 @@ def _worlds(
         return WorldTrials(model, device, worlds=worlds, threads=threads, all_directions=all_directions)
 
     return keep("simulate", (model, device, all_directions), make) if keep else make()
+
+
+def load_world_kernels(
+    hand: HandRecord, objects: Sequence[ObjectRecord], rows: GraspRows, protocol: Protocol, device: str
+) -> None:
+    """Compile what a GPU needs to simulate rows, before meshes are cut: their hulls stand in for the pieces, as kernels
+    depend on joints and on the kinds of solids, not on how many there are.
+
+    Raises:
+        LgraspError: as of :func:`scene_of` and :func:`verdicts`.
+    """
+    from lgrasp.simulate.worlds import Placed, Worlds
+
+    scene = scene_of(hand, objects, lambda vertices, faces, **_: [vertices])
+    for group in group_rows(rows, scene.objects):
+        model = build_model(scene, protocol, rows.q[0], group.objects)
+        Worlds(model, Placed.of(model, device), 1, device)
 
 
 def _on_threads(

@@ -9,6 +9,7 @@ import warp as wp
 
 from lgrasp.runtime.device import KERNEL_OPTIONS
 from lgrasp.runtime.fetch import fetch
+from lgrasp.runtime.kernels import load_launched
 from lgrasp.runtime.optional import import_mujoco, import_mujoco_warp
 from lgrasp.simulate.model import Model
 from lgrasp.simulate.noslip import NoSlip
@@ -236,6 +237,7 @@ class Worlds:
         """Compile what a step needs, and record it on a GPU; the state stays."""
         before = self.keep()
         with wp.ScopedDevice(self._device):
+            load_launched(self._one_step, str(self._device))
             self._one_step()
             if self._device.is_cuda:
                 with wp.ScopedCapture() as capture:

@@ -2,13 +2,14 @@
 
 import subprocess
 import sys
+from threading import Thread
 
 import pytest
 import warp as wp
 
 from lgrasp.errors import DeviceError
 from lgrasp.runtime.device import resolve_device
-from lgrasp.runtime.kernels import first_time
+from lgrasp.runtime.kernels import first_time, load_launched
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:
@@ -88,6 +89,41 @@ def test_the_first_kernels_of_a_machine_are_announced(tmp_path, monkeypatch):
     (tmp_path / "wp_module_1234567" / "module.cpu.o").touch()
     assert first_time("cpu") == ""
     assert first_time("cuda:0") != ""
+
+
+@wp.kernel(module="unique")
+def _add_one(x: wp.array(dtype=wp.int32)):
+    x[wp.tid()] += 1
+
+
+@wp.kernel(module="unique")
+def _add_two(x: wp.array(dtype=wp.int32)):
+    x[wp.tid()] += 2
+
+
+def test_what_a_library_launches_is_loaded_before_it_runs(monkeypatch):
+    x, y = (wp.zeros(3, dtype=wp.int32, device="cpu") for _ in range(2))
+    loaded, before = [], (wp.launch, wp.capture_while)
+    wp.load_module(_add_one.module, "cpu")
+
+    def library():
+        wp.launch(_add_one, 3, outputs=[x], device="cpu")
+        wp.capture_while(x, lambda k: wp.launch(_add_two, k, outputs=[x], device="cpu", block_dim=1), k=3)
+        other = Thread(target=lambda: wp.launch(_add_one, 3, outputs=[y], device="cpu"))
+        other.start()
+        other.join()
+
+    with monkeypatch.context() as patch:
+        real = wp.load_module
+        patch.setattr(wp, "load_module", lambda module, *a, **k: loaded.append(module) or real(module, *a, **k))
+        load_launched(library, "cpu")
+    assert set(loaded) == {_add_one.module, _add_two.module}
+    assert not x.numpy().any()
+    assert (y.numpy() == 1).all()  # what others do meanwhile is done
+    assert (wp.launch, wp.capture_while) == before
+    with pytest.raises(ZeroDivisionError):
+        load_launched(lambda: 1 / 0, "cpu")
+    assert (wp.launch, wp.capture_while) == before
 
 
 def test_auto_is_one_of_the_devices():

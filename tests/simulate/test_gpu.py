@@ -12,7 +12,7 @@ from support.twins import in_one_gripper, twin_rows, twin_shard
 from lgrasp.runtime.device import start
 from lgrasp.simulate.model import build_model
 from lgrasp.simulate.protocol import PROTOCOLS
-from lgrasp.simulate.run import group_rows, verdicts
+from lgrasp.simulate.run import group_rows, load_world_kernels, verdicts
 from lgrasp.simulate.scene import scene_of
 from lgrasp.simulate.verdict import stack_verdicts
 
@@ -63,6 +63,32 @@ def test_directions_end_with_the_first_that_is_lost(six):
     for name in ("directions", "holds", "diverged"):
         np.testing.assert_array_equal(here[f"fc_{name}"], there[f"fc_{name}"], err_msg=name)
     np.testing.assert_array_equal(np.isnan(here["fc_displacement"]), np.isnan(there["fc_displacement"]))
+
+
+def test_kernels_do_not_depend_on_how_objects_are_cut(jaws: Jaws, monkeypatch):
+    """Those compiled while a cube is cut are all that four cubes in its place need."""
+    from lgrasp.simulate.gpu import WorldTrials
+
+    shard, device = jaws.shard(0.002, count=1), "cuda:0" if GPU else "cpu"
+    load_world_kernels(shard.hand, shard.objects, shard.grasps, FC, device)
+    scene = scene_of(shard.hand, shard.objects)
+    (group,) = group_rows(shard.grasps, scene.objects)
+    quarters = tuple(
+        scene.objects[0].pieces[0] * [1, 0.5, 0.5] + [0, y, z] for y in (-0.01, 0.01) for z in (-0.01, 0.01)
+    )
+    cut = replace(scene, objects=(replace(scene.objects[0], pieces=quarters),))
+    load, loaded = wp.Module.load, []
+
+    def counted(self, *args, **options):
+        before = len(self.execs)
+        found = load(self, *args, **options)
+        if len(self.execs) > before:
+            loaded.append(self.name)
+        return found
+
+    monkeypatch.setattr(wp.Module, "load", counted)
+    WorldTrials(build_model(cut, FC, shard.grasps.q[0], group.objects), device, worlds=2)
+    assert loaded == []
 
 
 def test_hands_at_once():
