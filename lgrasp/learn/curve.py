@@ -1,7 +1,7 @@
 """Losses along a training, as the card of a network keeps them, and their picture."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,10 @@ class LossCurve:
     """Keeps losses that a training tells as (step, loss), in stretches of whole turns: ``turn`` steps, one for each
     object."""
 
-    def __init__(self, steps: int, told: Callable[[int, float], None] | None = None, *, turn: int = 1) -> None:
+    def __init__(self, steps: int, *, turn: int = 1) -> None:
         self.points: list[list[float]] = []
         """Last step and mean loss of each of as many equal stretches."""
-        self._steps, self._told, self._stretch = steps, told, math.ceil(steps / POINTS / turn) * turn
+        self._steps, self._stretch = steps, math.ceil(steps / POINTS / turn) * turn
         self._recent: list[float] = []
 
     def __call__(self, step: int, loss: float) -> None:
@@ -31,8 +31,14 @@ class LossCurve:
         if step - last >= self._stretch or step >= self._steps:
             add_point(self.points, step, sum(self._recent) / len(self._recent))
             self._recent = []
-        if self._told:
-            self._told(step, loss)
+
+    def state_dict(self) -> dict[str, list[Any]]:
+        """Of an interrupted training."""
+        return {"points": self.points, "recent": self._recent}
+
+    def load_state_dict(self, state: Mapping[str, list[Any]]) -> None:
+        """Go on from a :meth:`state_dict`."""
+        self.points, self._recent = state["points"], state["recent"]
 
 
 def add_point(points: list[list[float]], step: int, value: float) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from lgrasp.learn.curve import LossCurve
+from lgrasp.learn.loop import Descent, Training
 from lgrasp.learn.params import PosePolicyParams
 from lgrasp.policy.model import HIT_FEATURES, MOST_HITS, WIDTH, Weights
 from lgrasp.policy.score import (
@@ -83,29 +84,27 @@ def inputs_of(seen: Seen) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def fit_network(
-    seen: Seen, yields: np.ndarray, params: PosePolicyParams
+    seen: Seen, yields: np.ndarray, params: PosePolicyParams, training: Training, phase: str
 ) -> tuple[PoseNet, dict[str, list[list[float]]]]:
-    """A network of poses and whether they gave a grasp, (N,), and its loss along the training.
+    """A network of poses and whether they gave a grasp, (N,), and its loss along this phase of a training.
 
     Where only the share ``params.failures`` of the poses without a grasp is given, the odds count the others too.
     """
     inputs, wanted = inputs_of(seen), torch.from_numpy(yields.astype(np.float32))
-    state = torch.random.get_rng_state()
-    torch.manual_seed(params.seed)
-    net = PoseNet(seen.hits.shape[1], seen.distances.shape[1])
-    optimiser = torch.optim.AdamW(net.parameters(), lr=params.rate, weight_decay=params.decay)
     steps = max(1, params.epochs * len(wanted) // params.batch)
-    rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, params.rate, total_steps=steps + 1)
     curve = LossCurve(steps)
-    for step in range(steps):
+
+    def loss(_: int) -> tuple[torch.Tensor, torch.Tensor]:
         rows = torch.randint(len(wanted), (params.batch,))
-        loss = torch.nn.functional.binary_cross_entropy_with_logits(net(*(a[rows] for a in inputs)), wanted[rows])
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        rate.step()
-        curve(step + 1, loss.item())
-    torch.random.set_rng_state(state)
+        found = torch.nn.functional.binary_cross_entropy_with_logits(net(*(a[rows] for a in inputs)), wanted[rows])
+        return found, found
+
+    with torch.random.fork_rng([]):
+        torch.manual_seed(params.seed)
+        net = PoseNet(seen.hits.shape[1], seen.distances.shape[1])
+        optimiser = torch.optim.AdamW(net.parameters(), lr=params.rate, weight_decay=params.decay)
+        rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, params.rate, total_steps=steps + 1)
+        training.run(phase, steps, Descent(optimiser, rate), loss, parts={"net": net}, curve=curve)
     with torch.no_grad():
         net.last.bias.add_(math.log(params.failures))
     return net.eval(), {"loss": curve.points}

@@ -7,7 +7,9 @@ import torch
 from torch.nn import functional
 
 from lgrasp.hand.model import HandModel
+from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.examples import Examples
+from lgrasp.learn.loop import Descent, Training
 from lgrasp.learn.network import Coarse, CoarseNet, best_answers
 from lgrasp.learn.params import LearnParams
 from lgrasp.refine.refiner import Pose, Refiner
@@ -67,44 +69,54 @@ class Trainer:
         self.net = CoarseNet(lower, upper, params).to(self.device)
         torch.random.set_rng_state(state)
 
-    def fit_poses(self, steps: int, rate: float, told: Callable[[int, float], None] | None = None) -> None:
-        """Steps on poses alone, the learning rate falling to a tenth; ``told`` is called with (step, loss)."""
+    def fit_poses(self, training: Training, phase: str, steps: int, rate: float) -> LossCurve:
+        """Steps on poses alone, as a phase of a training, the learning rate falling to a tenth; the loss along them."""
         optimiser = torch.optim.Adam(self.net.parameters(), lr=rate)
         fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(steps, 1), 0.1 * rate)
-        for step in range(steps):
-            examples = self._train[step % len(self._train)]
-            batch = self._draw(examples)
-            loss = self._pose_loss(batch, examples)
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            fall.step()
-            if told:
-                told(step + 1, loss.item())
 
-    def fit_jointly(self, told: Callable[[int, float], None] | None = None) -> None:
-        """``joint_steps`` steps on the energy after K unrolled steps of the refiner.
+        def loss(step: int) -> tuple[torch.Tensor, torch.Tensor]:
+            examples = self._train[step % len(self._train)]
+            found = self._pose_loss(self._draw(examples), examples)
+            return found, found
+
+        return self._run(training, phase, steps, Descent(optimiser, fall), loss, "loss")
+
+    def fit_jointly(self, training: Training) -> LossCurve:
+        """``joint_steps`` steps on the energy after K unrolled steps of the refiner, phase ``joint`` of a training; the
+        mean energy along them.
 
         The loss is the mean of log(1 + E*), so that a few hopeless answers do not drown the others, and
-        ``pose_weight`` times the loss on poses. ``told`` is called with (step, mean energy after the unrolled steps).
+        ``pose_weight`` times the loss on poses.
         """
         p = self.params
-        optimiser = torch.optim.Adam(self.net.parameters(), lr=p.joint_rate)
-        for step in range(p.joint_steps):
+
+        def loss(step: int) -> tuple[torch.Tensor, torch.Tensor]:
             examples = self._train[step % len(self._train)]
             batch = self._draw(examples)
             refiner = self.refiner(examples)
             pose = refiner.unrolled(*self.net(*batch)[:3], steps=p.unrolled)
             total = whole_energy(refiner, pose)
-            loss = total.clamp_min(0).log1p().mean()
+            found = total.clamp_min(0).log1p().mean()
             if p.pose_weight:
-                loss = loss + p.pose_weight * self._pose_loss(batch, examples)
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
-            optimiser.step()
-            if told:
-                told(step + 1, total.mean().item())
+                found = found + p.pose_weight * self._pose_loss(batch, examples)
+            return found, total.mean()
+
+        descent = Descent(torch.optim.Adam(self.net.parameters(), lr=p.joint_rate), clip=1.0)
+        return self._run(training, "joint", p.joint_steps, descent, loss, "energy")
+
+    def _run(
+        self,
+        training: Training,
+        phase: str,
+        steps: int,
+        descent: Descent,
+        loss: Callable[[int], tuple[torch.Tensor, torch.Tensor]],
+        name: str,
+    ) -> LossCurve:
+        curve = LossCurve(steps, turn=len(self._train))
+        parts = {"net": self.net, "random": self._random}
+        training.run(phase, steps, descent, loss, parts=parts, name=name, curve=curve)
+        return curve
 
     def refiner(self, examples: Examples) -> Refiner:
         """The refiner of an object."""

@@ -19,8 +19,9 @@ from lgrasp.learn.grasp.examples import first_steps, grasp_examples
 from lgrasp.learn.grasp.file import Networks, load_networks, predictor_bytes
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.grasp.predictor import GraspPredictor
-from lgrasp.learn.grasp.solids import VIEWS, random_solids
+from lgrasp.learn.grasp.solids import VIEWS, random_solids, solid_arrays, solids_of
 from lgrasp.learn.grasp.views import draw_views, make_view
+from lgrasp.learn.loop import Training
 from lgrasp.learn.networks import network_bytes, open_network
 from lgrasp.object.sdf import sample_sdf
 
@@ -145,7 +146,8 @@ def test_completing_is_learnt():
         return ((found < 0) != (goal < 0)[:, None]).float().mean((0, 2, 3, 4))
 
     before = wrong()
-    fit_completion(net, views, params, None)
+    curve = fit_completion(net, views, params, Training())
+    assert curve.points[-1][1] < 0.8 * curve.points[0][1]
     assert (wrong() < 0.8 * before).all()
 
 
@@ -166,12 +168,17 @@ def test_surfaces_are_those_of_their_shares():
 
 
 def test_solids_are_seen_as_cameras_see_them(monkeypatch):
-    solids = random_solids(0, 2, 64)
+    solids = random_solids(0, range(2), 64)
     assert [len(solid.views) for solid in solids] == [VIEWS] * 2
     monkeypatch.setattr("lgrasp.learn.grasp.solids._A_PROCESS", 1)
     monkeypatch.setattr("lgrasp.learn.grasp.solids.ProcessPool", ThreadPoolExecutor)
-    for one, other in zip(random_solids(0, 2, 64), solids, strict=True):
+    for one, other in zip(random_solids(0, range(2), 64), solids, strict=True):
         np.testing.assert_array_equal(one.grid.values, other.grid.values)
+    for one, other in zip(solids_of(solid_arrays(solids)), solids, strict=True):  # as they are kept
+        assert (one.grid.cell, *one.grid.origin) == (other.grid.cell, *other.grid.origin)
+        np.testing.assert_array_equal(one.grid.values, other.grid.values)
+        for kept, view in zip(one.views, other.views, strict=True):
+            assert all((a == b).all() and a.dtype == b.dtype for a, b in zip(kept, view, strict=True))
     views = solid_views(solids, "cpu")
     at = views.points @ views.R.mT + views.t[:, None]
     away = views.grids.value(at, (torch.arange(2 * VIEWS) // VIEWS)[:, None]).abs()

@@ -10,6 +10,7 @@ from lgrasp.engine.inputs import Inputs
 from lgrasp.geometry.poses import pose_from_matrix
 from lgrasp.geometry.rotations import so3_exp
 from lgrasp.learn.examples import Examples, make_examples, palm_point, partial_clouds
+from lgrasp.learn.loop import Training
 from lgrasp.learn.network import Coarse, CoarseNet, best_answers, seed_frames
 from lgrasp.learn.params import LearnParams
 from lgrasp.learn.training import Trainer, measure, pose_loss, whole_energy
@@ -122,16 +123,15 @@ def test_training_lowers_the_loss_and_joint_training_the_energy(inputs: Inputs, 
     runs: list[list[float]] = [[], []]
     for losses in runs:
         trainer = Trainer(inputs.hand.model, [examples], params)
-        trainer.fit_poses(3, 3e-3, lambda step, loss, losses=losses: losses.append(loss))
+        losses += [loss for _, loss in trainer.fit_poses(Training(), "poses", 3, 3e-3).points]
     assert runs[0] == runs[1]  # the seed decides
     trainer = Trainer(inputs.hand.model, [examples], params)
-    losses = []
-    trainer.fit_poses(160, 3e-3, lambda step, loss: losses.append(loss))
-    assert np.mean(losses[-20:]) < 0.85 * np.mean(losses[:20])
+    losses = [loss for _, loss in trainer.fit_poses(Training(), "poses", 160, 3e-3).points]  # means of two
+    assert np.mean(losses[-10:]) < 0.85 * np.mean(losses[:10])
     before = copy.deepcopy(trainer.net.state_dict())
     frozen = measure(trainer, [held_out])
     assert frozen == measure(trainer, [held_out])
-    trainer.fit_jointly()
+    trainer.fit_jointly(Training())
     joint = measure(trainer, [held_out], rounds=(2,))
     assert joint.unrolled < 0.85 * frozen.unrolled
     assert joint.refined[0] < joint.coarse

@@ -64,6 +64,38 @@ def test_interrupted_before_there_is_anything_to_report(generate, cli, monkeypat
     assert not Path("net.pt").exists()
 
 
+def interrupted_at(steps, monkeypatch):
+    """Ctrl-C once so many steps are done."""
+    done = []
+    monkeypatch.setattr(JobProgress, "advanced", lambda self, part, n, *more: done.append(n))
+    monkeypatch.setattr(JobProgress, "cancelled", lambda self: bool(done) and done[-1] >= steps)
+
+
+def weights(path):
+    return {name: values.tolist() for name, values in torch.load(path, weights_only=True).items()}
+
+
+def test_interrupted_trainings_go_on(generate, cli, monkeypatch, tmp_path):
+    """In the first phase and in the last: the network is as if they had not been interrupted, and nothing is left."""
+    assert generate(rows=20).code == 0
+    asked = ["--steps", 10, "--joint-steps", 3, "--unrolled", 1, "--batch", 8, "--device", "cpu"]
+    assert cli("learn", "fit", "out", "--out", "whole.pt", *asked).code == 0
+    for steps in (4, 15):
+        with monkeypatch.context() as patch:
+            interrupted_at(steps, patch)
+            done = cli("learn", "fit", "out", "--out", "net.pt", *asked)
+        assert done.code == 130
+        assert done.err == f"interrupted: {steps} steps are kept; the same command makes the rest\n"
+        assert not Path("net.pt").exists()
+    assert cli("cache", "list").out.count("training") == 1
+    assert cli("learn", "fit", "out", "--out", "net.pt", *asked).code == 0
+    assert weights("net.pt") == weights("whole.pt")
+    shown = [json.loads(cli("learn", "show", path, "--json", "-").out)["report"] for path in ("net.pt", "whole.pt")]
+    assert shown[0]["curves"] == shown[1]["curves"]
+    assert shown[0]["joint"] == shown[1]["joint"]
+    assert "training" not in cli("cache", "list").out
+
+
 def test_bad_options(cli):
     line = cli("learn", "fit", "--model", "pose", "--steps", 5).error()
     assert "--steps is for --model coarse, diffuser, grasp; --set pose.KEY=VALUE takes shapes, " in line

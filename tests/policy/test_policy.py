@@ -16,6 +16,7 @@ from lgrasp.grasp.tables import CandidateTable, PoseTable
 from lgrasp.hand.arrays import Hand
 from lgrasp.jobs.hands import for_hand
 from lgrasp.jobs.learn.examples import make_pose_examples, seen_contacts, seen_reach
+from lgrasp.learn.loop import Training
 from lgrasp.learn.params import PosePolicyParams
 from lgrasp.learn.policy import PoseNet, Seen, fit_network, ranking, rate
 from lgrasp.math.limits import MAX_GROUPS
@@ -169,7 +170,9 @@ def test_a_network_learns_where_objects_are_held():
     count, com = rng.integers(0, MOST_HITS + 1, (n, 2)), rng.normal(0, 0.03, (n, 3)).astype(np.float32)
     seen = Seen(hits, count, count / 48, com, np.zeros(n, bool), np.zeros((n, 0), np.float32))
     yields = (count.min(1) >= 3) & (com[:, 0] > 0)
-    net, _ = fit_network(seen, yields, PosePolicyParams.model_validate({"epochs": 20, "batch": 128}))
+    net, _ = fit_network(
+        seen, yields, PosePolicyParams.model_validate({"epochs": 20, "batch": 128}), Training(), "reach"
+    )
     found = ranking(rate(net, seen), yields)
     assert found is not None
     assert found > 0.97
@@ -187,7 +190,7 @@ def test_odds_count_the_failures_left_out():
     seen = Seen(hits, np.zeros((n, 1), int), np.zeros((n, 1)), com, np.zeros(n, bool), np.zeros((n, 0), np.float32))
     some = Seen(*(column[told] for column in seen))
     asked = PosePolicyParams.model_validate({"failures": 0.1, "epochs": 60, "batch": 256})
-    net, _ = fit_network(some, yields[told], asked)
+    net, _ = fit_network(some, yields[told], asked, Training(), "reach")
     chance = 1 / (1 + np.exp(-rate(net, seen)))
     assert chance.sum() == pytest.approx(yields.sum(), rel=0.15)
     assert chance[com[:, 0] > 0.045].mean() == pytest.approx(0.25, rel=0.2)

@@ -40,8 +40,8 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
         examples = StepExamples(hand.tree, found.steps, found.clouds, found.grids, net, p, self.device_used.alias)
         trainer = StepTrainer(net, examples, unseen, p, self.device_used.alias)
         read = time.perf_counter() - start
-        curve = trainer.fit(lambda step, loss: progress(step, f"loss {loss:.3f}"))
-        seconds = {"reading": read, "training": time.perf_counter() - start - read}
+        curve = trainer.fit(training := self.training(progress))
+        seconds = {"reading": read, "training": training.seconds["drawing"]}
         report = training_report(hand.name, trainer, found.object_names, unseen, seconds, {"drawing": curve})
         about = AboutDiffuser(hand.name, hand.sha256, found.space_names, p, self.key(), report)
         return Made(part.rows, diffuser_bytes(trainer.kept, about))

@@ -1,6 +1,6 @@
 """Examples for a pose policy: poses that the pipeline placed, what was seen there, and whether they gave a grasp."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +34,19 @@ class PoseExamples(NamedTuple):
     contacts: Seen
     """What is realised after the first contacts."""
     contacts_yields: np.ndarray
+
+
+def example_arrays(examples: PoseExamples) -> dict[str, np.ndarray]:
+    """Examples, to be kept."""
+    parts = {"reach": examples.reach, "contacts": examples.contacts}
+    arrays = {f"{name}/{field}": values for name, seen in parts.items() for field, values in seen._asdict().items()}
+    return arrays | {"reach_yields": examples.reach_yields, "contacts_yields": examples.contacts_yields}
+
+
+def examples_of(arrays: Mapping[str, np.ndarray]) -> PoseExamples:
+    """Those of :func:`example_arrays`."""
+    reach, contacts = (Seen(*(arrays[f"{name}/{field}"] for field in Seen._fields)) for name in ("reach", "contacts"))
+    return PoseExamples(reach, arrays["reach_yields"], contacts, arrays["contacts_yields"])
 
 
 def join_examples(parts: list[PoseExamples]) -> PoseExamples:

@@ -4,6 +4,7 @@ what its plans are worth on the true meshes of objects, from clouds of them."""
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -35,7 +36,6 @@ from lgrasp.jobs.refine.predicted import predicted_planner
 from lgrasp.jobs.requests.shards import GraspRequest
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import hand_of_shard, object_of_shard, palmar_side
-from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.diffuser.examples import SequenceSteps, make_net
 from lgrasp.learn.diffuser.features import mesh_centre
 from lgrasp.learn.diffuser.senses import coarse_grid
@@ -45,7 +45,7 @@ from lgrasp.learn.grasp.completion import CompletionNet
 from lgrasp.learn.grasp.completion_training import ViewSet, fit_completion, solid_views
 from lgrasp.learn.grasp.examples import first_steps, grasp_examples
 from lgrasp.learn.grasp.file import KIND, VERSION, Networks, load_networks, predictor_bytes
-from lgrasp.learn.grasp.solids import random_solids
+from lgrasp.learn.grasp.solids import SeenSolid, random_solids, solid_arrays, solids_of
 from lgrasp.learn.grasp.views import SIDES, camera, draw_views
 from lgrasp.learn.networks import SHARDS, check_network_hand
 from lgrasp.object.arrays import upload_object
@@ -57,6 +57,7 @@ KINDS = ("full", "one view")
 """Of clouds that are measured on."""
 
 _LEAST = 64  # grasps to learn from
+_SOLIDS = 256  # that are kept at a time
 
 
 class GraspJob(GraspRequest, NetworkJob):
@@ -75,22 +76,35 @@ class GraspJob(GraspRequest, NetworkJob):
         completes = CompletionNet(p.channels).to(alias)
         torch.random.set_rng_state(state)
         start = time.perf_counter()
-        solids = random_solids(p.seed, p.shapes, p.cloud, lambda made: progress(0, f"{made:,} of {p.shapes:,} solids"))
+        solids = self._solids(progress)
         seconds["solids"] = time.perf_counter() - start
-        start = time.perf_counter()
-        completion = LossCurve(p.completion_steps, lambda step, loss: progress(step, f"loss {loss:.3f}"))
-        error = fit_completion(completes, solid_views(solids, alias), p, completion)
-        seconds["completion"] = time.perf_counter() - start
-        start = time.perf_counter()
+        training = self.training(progress)
+        completion = fit_completion(completes, solid_views(solids, alias), p, training).points
         draws = make_net(hand, 1, p)
         examples = grasp_examples(hand.tree, steps, views, draws, completes, p)
         trainer = StepTrainer(draws, examples, unseen, p, alias)
-        curve = trainer.fit(lambda step, loss: progress(p.completion_steps + step, f"loss {loss:.3f}"))
-        seconds["training"] = time.perf_counter() - start
-        names, curves = [r.name for r in records], {"completion": {"loss": completion.points}, "drawing": curve}
-        report = training_report(hand.name, trainer, names, unseen, seconds, curves) | {"completion_loss": error}
+        curves = {"completion": {"loss": completion}, "drawing": trainer.fit(training)}
+        seconds |= {"completion": training.seconds["completion"], "training": training.seconds["drawing"]}
+        error = np.mean([loss for step, loss in completion if step > 0.9 * p.completion_steps])  # the last tenth's
+        report = training_report(hand.name, trainer, [r.name for r in records], unseen, seconds, curves)
+        report |= {"completion_loss": float(error)}
         made = Networks(trainer.kept, completes, p, hand.name, hand.sha256, self.key(), report)
         return Made(part.rows, predictor_bytes(made))
+
+    def made_before(self) -> list[str]:
+        return [f"solids {first}" for first in range(0, self.params.shapes, _SOLIDS)]
+
+    def _solids(self, progress: PartProgress) -> list[SeenSolid]:
+        p, solids = self.params, list[SeenSolid]()
+        for name in self.made_before():
+            numbers = range(len(solids), min(len(solids) + _SOLIDS, p.shapes))
+
+            def told(made: int, first: int = numbers.start) -> None:
+                progress(0, f"{first + made:,} of {p.shapes:,} solids")
+
+            make = partial(random_solids, p.seed, numbers, p.cloud, told)
+            solids += solids_of(self.kept(name, lambda make=make: solid_arrays(make())))
+        return solids
 
     def _examples(self) -> tuple[HandModel, list[ObjectRecord], SequenceSteps, ViewSet]:
         """The hand, objects, grasps and views."""

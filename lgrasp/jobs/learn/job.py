@@ -22,7 +22,6 @@ from lgrasp.jobs.learn.network import NetworkJob
 from lgrasp.jobs.requests.shards import refine_params
 from lgrasp.jobs.scenes.shards import load_hand, read_parts
 from lgrasp.jobs.shard_inputs import object_of_shard
-from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.examples import Examples, make_examples
 from lgrasp.learn.network import Coarse, CoarseNet
 from lgrasp.learn.networks import SHARDS, check_network_hand, check_trained, network_bytes, open_network
@@ -49,39 +48,29 @@ class FitJob(NetworkJob):
     """
 
     kind: ClassVar[tuple[str, int]] = ("coarse", 2)
-    steps: ClassVar[tuple[str, ...]] = ("steps", "joint_steps")
+    steps: ClassVar[tuple[str, ...]] = ("steps", "joint_steps", "joint_steps")
 
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, device = self.params, self.device_used.alias
         hand, train, held_out = read_examples(self.shards, self.hand, p, self.cache, device)
         self.enough(sum(len(e.q) for e in train), "grasps", _MIN_GRASPS)
         trainer = Trainer(hand, train, p, device=device)
-        start = time.perf_counter()
-        turn = len(train)
-        poses = LossCurve(p.steps, lambda step, loss: progress(step, f"loss {loss:.3f}"), turn=turn)
-        trainer.fit_poses(p.steps, p.rate, poses)
-        seconds = {"poses": time.perf_counter() - start}
+        training = self.training(progress)
+        poses = trainer.fit_poses(training, "poses", p.steps, p.rate)
         report: dict[str, Any] = {"hand": hand.name, "objects": [e.model.name for e in train]}
         curves = {"poses": {"loss": poses.points}}
         report["frozen"] = energy_numbers(measure(trainer, held_out))
         if p.joint_steps:
             before = copy.deepcopy(trainer.net.state_dict())
-            trainer.fit_poses(p.joint_steps, p.joint_rate)
+            trainer.fit_poses(training, "longer", p.joint_steps, p.joint_rate)
             report["longer"] = energy_numbers(measure(trainer, held_out))
             trainer.net.load_state_dict(before)
-            start = time.perf_counter()
-
-            def told(step: int, energy: float) -> None:
-                progress(p.steps + step, f"energy {energy:.3f}")
-
-            joint = LossCurve(p.joint_steps, told, turn=turn)
-            trainer.fit_jointly(joint)
-            curves["joint"] = {"energy": joint.points}
-            seconds["joint"] = time.perf_counter() - start
+            curves["joint"] = {"energy": trainer.fit_jointly(training).points}
             report["joint"] = energy_numbers(measure(trainer, held_out))
             report["lowered"] = {
                 name: 1.0 - report["joint"][name] / report["frozen"][name] for name in ("coarse", "unrolled")
             }
+        seconds = {name: taken for name, taken in training.seconds.items() if name in curves}
         report |= {"seconds": seconds, "curves": curves, "params": p.model_dump(mode="json")}
         card: dict[str, Any] = dict(zip(("kind", "version"), self.kind, strict=True))
         card |= {"hand": hand.name, "hand_sha256": hand.sha256, "params": report["params"], "run_key": self.key()}

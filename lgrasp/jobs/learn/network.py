@@ -1,8 +1,9 @@
 """What the jobs that train a network on shards and keep it in one file share."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -25,6 +26,10 @@ if TYPE_CHECKING:  # torch takes a second to import
     from lgrasp.learn.curve import Curves
     from lgrasp.learn.diffuser.examples import SequenceSteps
     from lgrasp.learn.diffuser.training import StepTrainer
+    from lgrasp.learn.loop import Told, Training
+
+
+_KEPT, _STEPS = "training", "/steps"  # kind of what is kept of a training in the cache; member with its steps
 
 
 class FileJob(Job):
@@ -54,6 +59,41 @@ class FileJob(Job):
 
     def write(self, part: Part, contents: Any) -> None:
         write_file(part.file, contents)
+        for name in ("", *self.made_before()):
+            self.cache.discard(_KEPT, self._kept_key(name))
+
+    def made_before(self) -> list[str]:
+        """Names of what is made for the training."""
+        return []
+
+    def kept(self, name: str, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """Something that is made for the training, or that an interrupted run made."""
+        return self.cache.get(_KEPT, self._kept_key(name), make)[0]
+
+    def has_kept(self, name: str) -> bool:
+        """Whether an interrupted run made it."""
+        return self.cache.has(_KEPT, self._kept_key(name))
+
+    def training(self, told: "Told") -> "Training":
+        """The training of the file, which goes on where an earlier run was interrupted."""
+        from lgrasp.learn.loop import Training
+
+        def keep(phases: dict[str, bytes], steps: int) -> None:
+            arrays = {name: np.frombuffer(state, np.uint8) for name, state in phases.items()}
+            self.cache.store(_KEPT, key, arrays | {_STEPS: np.array(steps)})
+
+        key = self._kept_key()
+        kept = self.cache.load(_KEPT, key) or {}
+        kept.pop(_STEPS, None)
+        return Training(told, {name: state.tobytes() for name, state in kept.items()}, keep)
+
+    def kept_of(self, part: Part) -> int:
+        kept = self.cache.load(_KEPT, self._kept_key())
+        return int(kept[_STEPS]) if kept else 0
+
+    def _kept_key(self, name: str = "") -> str:
+        kind = self.device_used.alias.partition(":")[0]
+        return content_key(_KEPT, 1, job=self.key(), torch=version("torch"), device=kind, name=name)
 
 
 class NetworkJob(FitRequest, FileJob):

@@ -20,6 +20,8 @@ from lgrasp.hand.arrays import HandArrays, upload_hand
 from lgrasp.jobs.hands import for_hand, hand_source
 from lgrasp.jobs.learn.examples import (
     PoseExamples,
+    example_arrays,
+    examples_of,
     join_examples,
     make_pose_examples,
     reach_points,
@@ -111,7 +113,7 @@ class PolicyJob(PolicyRequest, FileJob):
             for found in pool.map(lambda number: self._examples(learned, number, points), range(self.count)):
                 examples.append(found)
                 gave = sum(int(e.contacts_yields.sum()) for e in examples)
-                progress((self.count + len(examples)) // 2, f"{gave:,} poses gave grasps")
+                progress(min((self.count + len(examples)) // 2, self.count - 1), f"{gave:,} poses gave grasps")
         seconds = {"examples": time.perf_counter() - start}
         order = np.random.default_rng(p.seed).permutation(self.count)
         held = min(max(1, round(p.held_out * self.count)), self.count - 1)
@@ -124,10 +126,10 @@ class PolicyJob(PolicyRequest, FileJob):
         yielding = int(train.contacts_yields.sum() + test.contacts_yields.sum())
         worth = _PROPOSALS / math.sqrt(yielding / (self.count * p.candidates))
         proposals = min(max(round(worth), LEAST_PROPOSALS), MOST_PROPOSALS)
-        start = time.perf_counter()
-        by_reach, reach_curve = fit_network(train.reach, train.reach_yields, p)
-        by_contacts, contacts_curve = fit_network(train.contacts, train.contacts_yields, p)
-        seconds["training"] = time.perf_counter() - start
+        training = self.training(lambda _, words, *, kept: progress(self.count - 1, words))
+        by_reach, reach_curve = fit_network(train.reach, train.reach_yields, p, training, "reach")
+        by_contacts, contacts_curve = fit_network(train.contacts, train.contacts_yields, p, training, "contacts")
+        seconds["training"] = sum(training.seconds.values())
         report = {
             "hand": hand.name,
             "objects": ", ".join(self.objects) or f"{self.count} random shapes",
@@ -152,16 +154,31 @@ class PolicyJob(PolicyRequest, FileJob):
         if len(source_weights(learned)) < 2:
             return {}
         tried = max(1, self.params.candidates // _SOURCE_SHARE)
-        counts = pool.map(lambda k: source_yields(learned, self._context(learned, k), tried), range(self.count))
+
+        def count(number: int) -> dict[str, np.ndarray]:
+            found = source_yields(learned, self._context(learned, number), tried)
+            return {name: np.array(grasps) for name, grasps in found.items()}
+
+        counts = pool.map(lambda k: self.kept(f"sources {k}", lambda: count(k)), range(self.count))
         found: Counter[str] = Counter()
         for number, each in enumerate(counts, 1):
-            found.update(each)
+            found.update({name: int(grasps) for name, grasps in each.items()})
             progress(number // 2, "sources of poses, each alone")
         return {name: math.sqrt((found[name] + 1) / (self.count * tried + 1)) for name in source_weights(learned)}
 
+    def kept_of(self, part: Part) -> int:
+        return sum(self.has_kept(f"examples {number}") for number in range(self.count))
+
+    def made_before(self) -> list[str]:
+        return [f"{what} {number}" for number in range(self.count) for what in ("sources", "examples")]
+
     def _examples(self, learned: Pipeline, number: int, points: np.ndarray) -> PoseExamples:
-        realising = self.pipeline.without("adjust", "close")
-        return make_pose_examples(learned, realising, self._context(learned, number), points, self.params)
+        def make() -> dict[str, np.ndarray]:
+            realising = self.pipeline.without("adjust", "close")
+            context = self._context(learned, number)
+            return example_arrays(make_pose_examples(learned, realising, context, points, self.params))
+
+        return examples_of(self.kept(f"examples {number}", make))
 
     def _context(self, learned: Pipeline, number: int) -> Context:
         """In which an object is searched."""

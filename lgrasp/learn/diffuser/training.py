@@ -7,11 +7,12 @@ from typing import Any
 
 import torch
 
-from lgrasp.learn.curve import add_point
+from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.diffuser.examples import StepExamples, split_steps
 from lgrasp.learn.diffuser.network import DiffuserNet, Situation
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.diffuser.process import PROCESSES, Process
+from lgrasp.learn.loop import Descent, Training, falling_rate
 
 _TOLD = 50  # steps between two looks at the loss: each look waits for the device
 _LOOKS = 40  # at what is learnt, for the curve
@@ -39,45 +40,37 @@ class StepTrainer:
         self.rows, self.unseen_rows = split_steps(examples.steps.object, examples.steps.held, unseen.to(self.device))
         self._random = torch.Generator(self.device).manual_seed(params.seed)
 
-    def fit(self, told: Callable[[int, float], None] | None = None) -> dict[str, list[list[float]]]:
-        """All steps of the training; ``told`` is called with (step, mean loss since the last call) now and then.
+    def fit(self, training: Training, phase: str = "drawing") -> dict[str, list[list[float]]]:
+        """All steps, as a phase of a training.
 
         Returns:
             Loss of the kept weights on objects that are trained on and on ``unseen`` ones, along the training.
         """
-        curves: dict[str, list[list[float]]] = {"loss": [], "unseen": []}
-        with torch.random.fork_rng():
-            torch.manual_seed(self.params.seed)  # of dropout
-            self._fit(told, curves)
-        return {name: points for name, points in curves.items() if points}
-
-    def _fit(self, told: Callable[[int, float], None] | None, curves: dict[str, list[list[float]]]) -> None:
         p, weights = self.params, list(self.net.parameters())
         optimiser = torch.optim.AdamW(weights, lr=p.rate, weight_decay=p.decay, fused=self.device.type == "cuda")
-        rate = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _share(step, p.steps))
-        total, counted = torch.zeros((), device=self.device), 0
-        for step in range(p.steps):
+        descent = Descent(optimiser, falling_rate(optimiser, p.steps, _WARM), clip=1.0)
+        curves = {name: LossCurve(p.steps) for name in ("loss", "unseen")}
+
+        def loss(_: int) -> tuple[torch.Tensor, torch.Tensor]:
             picked = torch.randint(len(self.rows), (p.batch,), generator=self._random, device=self.device)
-            loss = _loss(self.net, self.examples, self.rows[picked], self.process, self._random, self._blinded)
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(weights, 1.0)
-            optimiser.step()
-            rate.step()
+            found = _loss(self.net, self.examples, self.rows[picked], self.process, self._random, self._blinded)
+            return found, found
+
+        def after(done: int) -> None:
             with torch.no_grad():
-                # a young mean forgets the random weights soon
-                decay = min(p.average, (1 + step) / (10 + step))
+                decay = min(p.average, done / (9 + done))  # a young mean forgets the random weights soon
                 for kept, new in zip(self.kept.parameters(), weights, strict=True):
                     kept.lerp_(new, 1 - decay)
-            total, counted = total + loss.detach(), counted + 1
-            if told and ((step + 1) % _TOLD == 0 or step + 1 == p.steps):
-                told(step + 1, float(total) / counted)
-                total, counted = torch.zeros((), device=self.device), 0
-            if (step + 1) % math.ceil(p.steps / _LOOKS) == 0 or step + 1 == p.steps:
-                for points, rows in zip(curves.values(), (self.rows, self.unseen_rows), strict=True):
+            if done % math.ceil(p.steps / _LOOKS) == 0 or done == p.steps:
+                for curve, rows in zip(curves.values(), (self.rows, self.unseen_rows), strict=True):
                     if len(rows):
-                        found = mean_loss(self.kept, self.examples, rows, self.process, most=_LOOKED_AT)
-                        add_point(points, step + 1, found)
+                        curve(done, mean_loss(self.kept, self.examples, rows, self.process, most=_LOOKED_AT))
+
+        parts = {"net": self.net, "kept": self.kept, "random": self._random, **curves}
+        with torch.random.fork_rng():
+            torch.manual_seed(p.seed)  # of dropout
+            training.run(phase, p.steps, descent, loss, parts=parts, every=_TOLD, after=after)
+        return {name: curve.points for name, curve in curves.items() if curve.points}
 
     def losses(self) -> tuple[float, float]:
         """Loss of the kept weights on steps that it was trained on, and on those of unseen objects (NaN of none)."""
@@ -125,8 +118,3 @@ def _loss(
     felt = examples.felt(rows, way, net.noisy_steps(mixed, process.coefficients(t)[0], situation))
     error = (net(mixed, t, net.situation(situation), felt) - velocity) * moving
     return (error**2).sum() / moving.sum()
-
-
-def _share(step: int, steps: int) -> float:
-    """Share of the learning rate: it rises, then falls like a cosine."""
-    return min(1.0, (step + 1) / _WARM) * 0.5 * (1 + math.cos(math.pi * min(step / steps, 1.0)))

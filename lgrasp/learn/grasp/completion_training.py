@@ -1,17 +1,18 @@
 """Training of the completing network on views of solids whose distances are known."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch.nn import functional
 from torch.nn.utils import convert_conv3d_weight_memory_format
 
 from lgrasp.differentiable.distance import DistanceGrids
+from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.grasp.completion import SHARES, CompletionNet, Cubes, cubes_of, unit_nodes
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.grasp.solids import SeenSolid
 from lgrasp.learn.grasp.views import CloudView
+from lgrasp.learn.loop import Descent, Training, falling_rate
 from lgrasp.object.sdf import SdfGrid
 
 _TOLD = 20  # steps between two looks at the loss
@@ -53,36 +54,29 @@ def solid_views(solids: Sequence[SeenSolid], device: torch.device | str) -> View
     return ViewSet([view for solid in solids for view in solid.views], [solid.grid for solid in solids], device)
 
 
-def fit_completion(
-    net: CompletionNet, views: ViewSet, p: GraspParams, told: Callable[[int, float], None] | None
-) -> float:
-    """Train a network in place; the mean loss of the last tenth of the steps.
+def fit_completion(net: CompletionNet, views: ViewSet, p: GraspParams, training: Training) -> LossCurve:
+    """Train a network in place, as phase ``completion`` of a training; the loss along it.
 
     Cubes are turned by right angles about z and mirrored at random.
     """
     cubes, goals = views.cubes(p.nodes)
     convert_conv3d_weight_memory_format(net.train(), torch.channels_last_3d)
     optimiser = torch.optim.AdamW(net.parameters(), lr=p.completion_rate, weight_decay=1e-4)
-    draw = torch.Generator().manual_seed(p.seed)
-    recent: list[torch.Tensor] = []
-    for step in range(p.completion_steps):
-        fall = 0.5 * (1 + math.cos(math.pi * step / p.completion_steps))
-        for group in optimiser.param_groups:
-            group["lr"] = p.completion_rate * min(1.0, (step + 1) / _WARM) * fall
+    draw, curve = torch.Generator().manual_seed(p.seed), LossCurve(p.completion_steps)
+
+    def loss(_: int) -> tuple[torch.Tensor, torch.Tensor]:
         chosen = torch.randint(len(goals), (p.completion_batch,), generator=draw).to(goals.device)
         turn, mirror = (int(torch.randint(n, (), generator=draw)) for n in (4, 2))
         given = Cubes(*(_turned(x, turn, mirror) for x in cubes.some(chosen)))
         goal = _turned(goals[chosen].float(), turn, mirror)
-        loss = completion_loss(net(given), goal, p.nodes)
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        optimiser.step()
-        recent.append(loss.detach())
-        if told and ((step + 1) % _TOLD == 0 or step + 1 == p.completion_steps):
-            told(step + 1, float(torch.stack(recent[-_TOLD:]).mean()))
+        found = completion_loss(net(given), goal, p.nodes)
+        return found, found
+
+    descent = Descent(optimiser, falling_rate(optimiser, p.completion_steps, _WARM), clip=1.0)
+    parts = {"net": net, "random": draw}
+    training.run("completion", p.completion_steps, descent, loss, parts=parts, every=_TOLD, curve=curve)
     convert_conv3d_weight_memory_format(net.eval(), torch.contiguous_format)
-    return float(torch.stack(recent[-max(1, p.completion_steps // 10) :]).mean())
+    return curve
 
 
 def completion_loss(found: torch.Tensor, goal: torch.Tensor, nodes: int) -> torch.Tensor:

@@ -1,6 +1,6 @@
 """Views of random solids, from which completing is learnt."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple, get_args
 
@@ -42,10 +42,10 @@ def random_solid(seed: int, number: int, points: int) -> SeenSolid:
 
 
 def random_solids(
-    seed: int, count: int, points: int, made: Callable[[int], None] = lambda done: None
+    seed: int, numbers: range, points: int, made: Callable[[int], None] = lambda done: None
 ) -> list[SeenSolid]:
-    """``count`` of them, by as many processes as there are cores; few are made here. ``made`` is told how many there
-    are."""
+    """Those of some numbers, by as many processes as there are cores; few are made here. ``made`` is told how many
+    there are."""
     solids: list[SeenSolid] = []
 
     def keep(found: Iterable[SeenSolid]) -> list[SeenSolid]:
@@ -54,9 +54,30 @@ def random_solids(
             made(len(solids))
         return solids
 
-    make = partial(random_solid, seed, points=points)
+    make, count = partial(random_solid, seed, points=points), len(numbers)
     if count < _A_PROCESS:
-        return keep(make(number) for number in range(count))
+        return keep(make(number) for number in numbers)
     with none_killed("makes solids"), ProcessPool(min(cores(), count // _A_PROCESS)) as pool:
-        waiting = [pool.submit(make, number) for number in range(count)]
+        waiting = [pool.submit(make, number) for number in numbers]
         return keep(future.result() for future in waiting)
+
+
+def solid_arrays(solids: Sequence[SeenSolid]) -> dict[str, np.ndarray]:
+    """Some solids with equally many views, to be kept."""
+    arrays = {name: np.stack([[getattr(v, name) for v in one.views] for one in solids]) for name in CloudView._fields}
+    grids = [one.grid for one in solids]
+    return arrays | {
+        "values": np.concatenate([grid.values.ravel() for grid in grids]),
+        "shape": np.array([grid.values.shape for grid in grids]),
+        "origin": np.stack([grid.origin for grid in grids]),
+        "cell": np.array([grid.cell for grid in grids]),
+    }
+
+
+def solids_of(arrays: Mapping[str, np.ndarray]) -> list[SeenSolid]:
+    """Those of :func:`solid_arrays`."""
+    ends = np.cumsum(arrays["shape"].prod(1))
+    values = [v.reshape(n) for v, n in zip(np.split(arrays["values"], ends[:-1]), arrays["shape"], strict=True)]
+    grids = map(SdfGrid, values, arrays["origin"], arrays["cell"].tolist())
+    views = zip(*(arrays[name] for name in CloudView._fields), strict=True)
+    return [SeenSolid(list(map(CloudView, *own)), grid) for own, grid in zip(views, grids, strict=True)]
