@@ -64,11 +64,11 @@ def test_interrupted_before_there_is_anything_to_report(generate, cli, monkeypat
     assert not Path("net.pt").exists()
 
 
-def interrupted_at(steps, monkeypatch):
-    """Ctrl-C once so many steps are done."""
-    done = []
-    monkeypatch.setattr(JobProgress, "advanced", lambda self, part, n, *more: done.append(n))
-    monkeypatch.setattr(JobProgress, "cancelled", lambda self: bool(done) and done[-1] >= steps)
+def interrupted_at(steps, monkeypatch, *, count=False):
+    """Ctrl-C once so many steps are done, or so many calls told of them."""
+    done = [0]
+    monkeypatch.setattr(JobProgress, "advanced", lambda self, part, n, *_: done.append(len(done) if count else n))
+    monkeypatch.setattr(JobProgress, "cancelled", lambda self: done[-1] >= steps)
 
 
 def weights(path):
@@ -225,15 +225,22 @@ def test_grasps_are_planned_from_a_cloud_by_a_network(generate, cli):
     assert "(kind 'diffuser')" in cli(*plan, "--model", "seq-allegro").error()
 
 
-def test_a_pose_policy_is_trained_and_used(cli, tmp_path):
+def test_a_pose_policy_is_trained_and_used(cli, tmp_path, monkeypatch):
     pipeline = tmp_path / "small.yaml"
     stages = "[place: {samples: 12}, domain: {rounds: 2}, ik: {}, search: {}, filter: {}]"
     pipeline.write_text(f"name: small\nfield: {{records: 20000}}\nstages: {stages}\n")
     options = ["--model", "pose", "--pipeline", pipeline, "--device", "cpu", "--object", "sphere", "--object", "tiny"]
     options += ["--set", "pose.candidates=64", "--set", "pose.epochs=1"]
-    for name in ("a", "b"):
-        done = cli("learn", "fit", *options, "--out", f"{name}.npz", "--json", "fit.json")
-        assert done.code == 0, done
+    assert cli("learn", "fit", *options, "--out", "a.npz").code == 0
+    for calls in (3, 1, 5):  # amid examples; at once, with what is kept; in the training
+        with monkeypatch.context() as patch:
+            interrupted_at(calls, patch, count=True)
+            done = cli("learn", "fit", *options, "--out", "b.npz")
+        assert done.code == 130, done
+        assert " objects are kept; the same command makes the rest" in done.err
+    done = cli("learn", "fit", *options, "--out", "b.npz", "--json", "fit.json")
+    assert done.code == 0, done
+    assert "training" not in cli("cache", "list").out
     assert Path("a.npz").read_bytes() == Path("b.npz").read_bytes()
     assert "--set place.policy=b.npz" in done.out
     report = json.loads(Path("fit.json").read_text())
