@@ -46,7 +46,7 @@ def check(paths: Shards) -> Answer:
 
     Example: lgrasp dataset check grasps
     """
-    from lgrasp.dataset.manifest import check_files
+    from lgrasp.dataset.differences import check_files
     from lgrasp.dataset.validate import validate_shard
 
     return checked(check_files(paths, validate_shard), "shard")

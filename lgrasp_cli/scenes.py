@@ -67,7 +67,7 @@ def check(paths: _Paths) -> Answer:
     from lgrasp.dataset.files import find_shards
 
     find_shards(paths, "scene")
-    from lgrasp.dataset.manifest import check_files
+    from lgrasp.dataset.differences import check_files
     from lgrasp.scenes.files import check_scene
 
     return checked(check_files(paths, check_scene, below=False), "scene")

@@ -1,6 +1,6 @@
 """Conditions on the values of a shard; used before writing and when validating."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +151,20 @@ def refuse_problems(
     """Raise ShardError if some rows of a file have :func:`row_problems`; ``use``: what cannot be done with them."""
     if problems := row_problems(rows, hand, objects, column, first_row=first_row):
         raise ShardError(f"{path}: {problems[0]}; grasps as 'lgrasp dataset check' accepts them can be {use}")
+
+
+def refuse_not_finite(
+    path: Path, object_index: np.ndarray, object_pose: np.ndarray, joints: Mapping[str, np.ndarray], first_row: int
+) -> None:
+    """Raise ShardError if some rows (n,) of a file have joints (n, K) by name, or poses (n, O, 7) of objects that are
+    there, index (n, O), which are not finite."""
+    problems: list[str] = []
+    require = requirer(problems, "grasps/", first_row)
+    for name, values in joints.items():
+        require(np.isfinite(values), f"{name}: not finite")
+    require((object_index < 0)[..., None] | np.isfinite(object_pose), "object_pose: not finite")
+    if problems:
+        raise ShardError(f"{path}: {problems[0]}")
 
 
 def _check_poses(rows: GraspRows, objects: int, require: Require) -> None:

@@ -12,8 +12,9 @@ import numpy as np
 
 from lgrasp.dataset.checks import row_problems
 from lgrasp.dataset.difference import NO_REASON, leaves, tell_difference
+from lgrasp.dataset.differences import compare
 from lgrasp.dataset.files import Paths, check_heaps, find_shards
-from lgrasp.dataset.manifest import MANIFEST, compare, read_manifest
+from lgrasp.dataset.manifest import MANIFEST, read_manifest
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.writer import column_texts, create_rows, finish, new_shard_file, write_context
 from lgrasp.errors import OutputError, ShardError

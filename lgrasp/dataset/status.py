@@ -5,16 +5,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from lgrasp.dataset.differences import Differences, compare
 from lgrasp.dataset.files import walk
-from lgrasp.dataset.manifest import (
-    MANIFEST,
-    SUFFIX,
-    Differences,
-    ListedRun,
-    compare,
-    read_manifest,
-    workers,
-)
+from lgrasp.dataset.manifest import MANIFEST, SUFFIX, ListedRun, read_manifest, workers
 from lgrasp.errors import ShardError
 
 _NEXT = {

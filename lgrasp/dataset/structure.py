@@ -247,7 +247,9 @@ def _attribute_problems(attrs: Any, path: str, spec: AttributeSpec) -> list[str]
 
 
 _KINDS = {
-    "text": ("a string", str),
+    "text": ("text that can be printed", lambda text: text if text.isprintable() else None),
+    "name": (r"a name: 1 to 255 characters that can be printed, no / \ [ ]", lambda n: None if name_problem(n) else n),
+    "lines": ("a string", str),
     "json": ("a JSON document", lambda text: [json.loads(text)]),
     "time": ("an ISO 8601 time", datetime.fromisoformat),
     "sha256": ("64 lower-case hex digits", re.compile("[0-9a-f]{64}").fullmatch),

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from lgrasp.choices import GroupName
+from lgrasp.dataset.differences import tell_differences
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.gather import gather
-from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.merge import pad_column, widest
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.split import Split, draw_split, read_groups

@@ -13,7 +13,8 @@ from typing import Any, ClassVar, NamedTuple, Self
 from pydantic import Field, PrivateAttr
 
 from lgrasp import __version__
-from lgrasp.dataset.manifest import ListedRun, ListedShard, is_as_listed
+from lgrasp.dataset.differences import is_as_listed
+from lgrasp.dataset.manifest import ListedRun, ListedShard
 from lgrasp.dataset.validate import validate_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import PrivateAttr
 
+from lgrasp.dataset.differences import tell_differences
 from lgrasp.dataset.extend import extend_shard
 from lgrasp.dataset.files import named_files
 from lgrasp.dataset.gather import gather, sound_files
-from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import Part

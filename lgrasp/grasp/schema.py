@@ -50,7 +50,7 @@ class AttributeSpec:
 
     path: str
     name: str
-    kind: Literal["text", "json", "time", "sha256", "int", "float", "bool"]
+    kind: Literal["text", "name", "lines", "json", "time", "sha256", "int", "float", "bool"]
     required: bool = True
 
 
@@ -123,7 +123,7 @@ SEQUENCE_DATASETS: tuple[DatasetSpec, ...] = (
 MODEL_ATTRIBUTES: tuple[AttributeSpec, ...] = (
     AttributeSpec("hand", "base_link", "text"),
     AttributeSpec("hand/meshes/*", "path", "text"),
-    AttributeSpec("objects/*", "name", "text"),
+    AttributeSpec("objects/*", "name", "name"),
     AttributeSpec("objects/*", "scale", "float"),
     AttributeSpec("objects/*", "sha256", "sha256"),
     AttributeSpec("objects/*", "watertight", "bool"),
@@ -134,7 +134,7 @@ ATTRIBUTES: tuple[AttributeSpec, ...] = (
     AttributeSpec("", "format", "text"),
     AttributeSpec("", "format_version", "text"),
     AttributeSpec("", "lgrasp_version", "text"),
-    AttributeSpec("", "hand", "text"),
+    AttributeSpec("", "hand", "name"),
     AttributeSpec("", "pipeline", "text"),
     AttributeSpec("", "created", "time"),
     AttributeSpec("", "seed", "int"),
@@ -148,5 +148,5 @@ ATTRIBUTES: tuple[AttributeSpec, ...] = (
     *MODEL_ATTRIBUTES,
     AttributeSpec("objects/*", "touch_share", "float", required=False),
     AttributeSpec("grasps/metrics/*", "unit", "text"),
-    AttributeSpec("grasps/physics/*", "protocol", "text"),
+    AttributeSpec("grasps/physics/*", "protocol", "lines"),
 )

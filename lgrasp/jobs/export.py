@@ -8,12 +8,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lgrasp.dataset.conditions import parse_condition
+from lgrasp.dataset.differences import tell_differences
 from lgrasp.dataset.exports.folder import INDEX
 from lgrasp.dataset.exports.formats import FORMATS, export_shards
 from lgrasp.dataset.exports.mjcf import Cut
 from lgrasp.dataset.exports.selection import chosen_rows, number_columns, verdict_columns
 from lgrasp.dataset.gather import gather
-from lgrasp.dataset.manifest import tell_differences
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.split import Split
 from lgrasp.engine.cache import content_key

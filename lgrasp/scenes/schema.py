@@ -35,7 +35,8 @@ DATASETS: tuple[DatasetSpec, ...] = (
 """Every dataset; all are required, a family (``*``) may be empty except ``objects``."""
 
 ATTRIBUTES: tuple[AttributeSpec, ...] = (
-    *(AttributeSpec("", name, "text") for name in ("format", "format_version", "lgrasp_version", "hand")),
+    *(AttributeSpec("", name, "text") for name in ("format", "format_version", "lgrasp_version")),
+    AttributeSpec("", "hand", "name"),
     *(AttributeSpec("", name, "int") for name in ("seed", "scene_index", "complete")),
     *(AttributeSpec("", name, "sha256") for name in ("hand_sha256", "text_sha256")),
     AttributeSpec("", "created", "time"),

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from support.jaws import Jaws
 from support.shards import sample_shard
 
 from lgrasp.dataset.exports.formats import export_shards
@@ -86,7 +87,25 @@ def upwards(file: h5py.File, folder: Path) -> None:
     file.move("objects/cup", "objects/..")
 
 
+def retold(path: str, name: str, text: str) -> Callable[[h5py.File, Path], None]:
+    """An attribute that says something else, as its author wrote it."""
+
+    def tamper(file: h5py.File, folder: Path) -> None:
+        file[path].attrs[name] = text
+        del file.attrs["text_sha256"]
+
+    return tamper
+
+
+RETOLD = (
+    retold("/", "hand", "al\x1b[31mle\ngro"),
+    retold("/", "hand", "../../allegro"),
+    retold("/", "pipeline", "rob\nust"),
+    retold("objects/cup", "name", "[red]cup"),
+    retold("hand", "base_link", "ba\x07se"),
+)
 TAMPERED = (
+    *RETOLD,
     external_storage,
     pipe,
     external_link,
@@ -125,6 +144,23 @@ def test_every_reader_refuses(tmp_path: Path, tamper: Callable[[h5py.File, Path]
     assert time.monotonic() - start < 60  # they end by themselves
     assert not (tmp_path / "all.h5").exists()
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["q", "q_squeeze", "object_pose"])
+def test_rows_that_are_not_finite_go_nowhere(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "a.h5"
+    write_shard(path, Jaws(tmp_path).shard(count=5))
+    with h5py.File(path, "r+") as file:
+        values = file["grasps"][name][()]
+        values[3, ..., 0] = np.inf
+        file["grasps"][name][...] = values
+    with pytest.raises(ShardError, match=rf"^{path}: .*{name}: not finite \(row 3, 1 rows\)$"):
+        export_shards([path], tmp_path / "out", "isaac-grasp")
+    assert not list((tmp_path / "out").glob("grasps/*"))
+    if name != "q_squeeze":  # of which nothing is reported
+        with pytest.raises(ShardError, match=rf"{name}: not finite \(row 3, 1 rows\)$"):
+            report_dataset([path], tmp_path / "r.html")
+        assert not (tmp_path / "r.html").exists()
 
 
 def no_object(file: h5py.File) -> None:

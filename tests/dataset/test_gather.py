@@ -9,9 +9,9 @@ import pytest
 from support.shards import sample_shard
 
 from lgrasp import notices
+from lgrasp.dataset.differences import check_files
 from lgrasp.dataset.gather import gather
 from lgrasp.dataset.info import describe
-from lgrasp.dataset.manifest import check_files
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.torch_dataset import GraspDataset

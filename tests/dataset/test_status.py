@@ -122,6 +122,20 @@ def test_check(tmp_path, said):
     assert result.stderr.startswith(f"{tmp_path / 'manifest.json'}: not a manifest of shards")
 
 
+def test_a_folder_below_that_lost_all_its_shards(tmp_path, said):
+    run(SampleJob(out=tmp_path / "a" / "lost"))
+    run(SampleJob(out=tmp_path / "b"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "manifest.json").write_text('{"name": "of a web page"}')
+    for path in (tmp_path / "a" / "lost").glob("*.h5"):
+        path.unlink()
+    lost = f"{tmp_path}/a/lost/manifest.json: 3 of 3 shards are missing, first toy-cup-00000.h5; {AGAIN}"
+    result = call("dataset", "check", tmp_path)
+    assert (result.exit_code, result.stderr) == (2, f"{lost}\n")
+    assert len(GraspDataset(tmp_path)) == 6
+    assert said == [lost]
+
+
 def test_a_run_without_shards_is_nothing(tmp_path):
     """As another program may list it."""
     (tmp_path / "manifest.json").write_text(Manifest(runs=[ListedRun(run_key="a")]).model_dump_json())

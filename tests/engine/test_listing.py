@@ -17,7 +17,8 @@ import pytest
 from support.jobs import SampleJob, StopAfter
 from support.shards import sample_shard
 
-from lgrasp.dataset.manifest import compare, read_manifest, update_manifest, workers
+from lgrasp.dataset.differences import compare
+from lgrasp.dataset.manifest import read_manifest, update_manifest, workers
 from lgrasp.dataset.merge import merge_shards
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine import listing

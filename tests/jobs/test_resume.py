@@ -13,7 +13,8 @@ import pytest
 from support.places import QUICK
 from support.resumed import Child
 
-from lgrasp.dataset.manifest import compare, read_manifest, workers
+from lgrasp.dataset.differences import compare
+from lgrasp.dataset.manifest import read_manifest, workers
 from lgrasp.dataset.reader import read_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine import shard as shard_module

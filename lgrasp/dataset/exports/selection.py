@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lgrasp.dataset.checks import refuse_not_finite
 from lgrasp.dataset.conditions import ALL, OBJECTS_HELD, Condition, satisfied_or_invalid
 from lgrasp.dataset.files import Paths
 from lgrasp.dataset.gather import gather
@@ -149,12 +150,18 @@ class Selection:
                         advance(len(some))
 
     def _read(self, reader: ShardReader, source: _Source, some: np.ndarray, start: int, names: Sequence[str]) -> Batch:
+        def whole(name: str) -> np.ndarray:
+            return reader.column(name, start, start + CHUNK_ROWS)
+
         def stored(name: str) -> np.ndarray:
-            return reader.column(name, start, start + CHUNK_ROWS)[source.rows[some] - start]
+            return (chunk[name] if name in chunk else whole(name))[source.rows[some] - start]
 
         def read(name: str) -> np.ndarray:
             return stored(name).astype(np.float64)
 
+        chunk = {name: whole(name) for name in ("object_index", "object_pose", *POSTURES)}
+        joints = {name: chunk[name] for name in POSTURES}
+        refuse_not_finite(source.path, chunk["object_index"], chunk["object_pose"], joints, start)
         pose, index = read("object_pose"), source.index[some]
         if self.single:
             present = np.argmax(index >= 0, axis=1)[:, None]

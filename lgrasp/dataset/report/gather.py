@@ -7,6 +7,7 @@ from functools import reduce
 
 import numpy as np
 
+from lgrasp.dataset.checks import refuse_not_finite
 from lgrasp.dataset.reader import ShardReader
 from lgrasp.dataset.report.diversity import Coverage, GraspSpread, TouchedSurface
 from lgrasp.dataset.report.quantity import QUANTITIES, Distribution
@@ -180,6 +181,7 @@ class HandRows:
         records, strict = reader.objects(), measured_strictly(reader.header.config)
         for start in range(0, len(reader), _BLOCK_ROWS):
             rows = reader.rows(start, start + _BLOCK_ROWS)
+            refuse_not_finite(reader.path, rows.object_index, rows.object_pose, {"q": rows.q}, start)
             q, links = rows.q.astype(float), rows.contact_links
             self.rows += len(q)
             self.sum_q += q.sum(0)
