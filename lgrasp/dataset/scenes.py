@@ -179,17 +179,26 @@ class SceneRows:
         return np.concatenate(parts)
 
     def chosen(self, where: Sequence[Condition]) -> np.ndarray:
-        """Rows that satisfy all conditions, rising.
+        """Rows that satisfy all conditions, rising; none of a shard that lacks a column, which is told.
 
         Raises:
-            ShardError: A shard lacks a column.
+            ShardError: All shards lack a column, or one cannot be read.
         """
         if not where:
             return np.flatnonzero(np.concatenate(list(self._grasps.values())))
-        good = []
+        good: list[np.ndarray] = []
+        lacking: list[ShardError] = []
         for path in self.files:
             with self._opened(path) as reader:
-                good.append(satisfied(reader, where))
+                try:
+                    good.append(satisfied(reader, where))
+                except ShardError as error:
+                    lacking.append(error)
+                    good.append(np.zeros(len(reader), bool))
+        if len(lacking) == len(self.files):
+            raise lacking[0]
+        if lacking:
+            notice(f"{len(lacking)} of {len(self.files)} shards are left out, first {lacking[0]}")
         return np.flatnonzero(np.concatenate(good))
 
     def meeting(self, where: str) -> Sequence[int] | np.ndarray:
@@ -197,7 +206,7 @@ class SceneRows:
 
         Raises:
             ConfigError: A condition cannot be read, or no row meets them.
-            ShardError: A shard lacks a column.
+            ShardError: As of :meth:`chosen`.
         """
         conditions = tuple(parse_condition(text) for text in where.split(",") if text.strip())
         if not conditions:

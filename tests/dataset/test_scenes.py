@@ -53,6 +53,21 @@ def test_spread_is_even_and_complete(folder):
     assert rows.spread(2) == [1, 3]
 
 
+def test_shards_without_a_column_have_no_row_that_meets_it(folder, said):
+    first, rows = folder / "a" / "a.h5", SceneRows(folder)
+    with pytest.raises(ShardError, match="no column 'physics/fc_holds'"):
+        rows.meeting("physics/fc_holds")
+    with h5py.File(first, "r+") as file:
+        n = len(file["grasps/q"])
+        file.create_dataset("grasps/physics/fc_holds", data=np.arange(n) != 1).attrs["protocol"] = "{}"
+        del file.attrs["text_sha256"]
+    rows = SceneRows(folder)
+    assert list(rows.meeting("physics/fc_holds")) == [k for k in range(n) if k != 1]
+    assert "1 of 2 shards are left out, first " in said[-1]
+    assert "b.h5: no column 'physics/fc_holds'" in said[-1]
+    assert len(rows.meeting("metrics/valid == 1")) == 5
+
+
 def test_captions_tell_what_differs(folder):
     rows = SceneRows(folder)
     assert rows.caption(1, [0, 1]) == "row 1"
