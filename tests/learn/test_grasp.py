@@ -146,7 +146,7 @@ def test_completing_is_learnt():
         return ((found < 0) != (goal < 0)[:, None]).float().mean((0, 2, 3, 4))
 
     before = wrong()
-    curve = fit_completion(net, views, params, Training())
+    curve = fit_completion(net, lambda: (cubes, goal), params, Training())
     assert curve.points[-1][1] < 0.8 * curve.points[0][1]
     assert (wrong() < 0.8 * before).all()
 

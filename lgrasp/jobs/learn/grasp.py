@@ -41,7 +41,7 @@ from lgrasp.learn.diffuser.features import mesh_centre
 from lgrasp.learn.diffuser.senses import coarse_grid
 from lgrasp.learn.diffuser.training import StepTrainer
 from lgrasp.learn.examples import seen_cloud
-from lgrasp.learn.grasp.completion import CompletionNet
+from lgrasp.learn.grasp.completion import CompletionNet, Cubes
 from lgrasp.learn.grasp.completion_training import ViewSet, fit_completion, solid_views
 from lgrasp.learn.grasp.examples import first_steps, grasp_examples
 from lgrasp.learn.grasp.file import KIND, VERSION, Networks, load_networks, predictor_bytes
@@ -75,11 +75,8 @@ class GraspJob(GraspRequest, NetworkJob):
         torch.manual_seed(p.seed)
         completes = CompletionNet(p.channels).to(alias)
         torch.random.set_rng_state(state)
-        start = time.perf_counter()
-        solids = self._solids(progress)
-        seconds["solids"] = time.perf_counter() - start
         training = self.training(progress)
-        completion = fit_completion(completes, solid_views(solids, alias), p, training).points
+        completion = fit_completion(completes, lambda: self._cubes(progress), p, training).points
         draws = make_net(hand, 1, p)
         examples = grasp_examples(hand.tree, steps, views, draws, completes, p)
         trainer = StepTrainer(draws, examples, unseen, p, alias)
@@ -93,6 +90,11 @@ class GraspJob(GraspRequest, NetworkJob):
 
     def made_before(self) -> list[str]:
         return [f"solids {first}" for first in range(0, self.params.shapes, _SOLIDS)]
+
+    def _cubes(self, progress: PartProgress) -> tuple[Cubes, torch.Tensor]:
+        """What completing is learnt from."""
+        views = solid_views(self._solids(progress), self.device_used.alias)
+        return views.cubes(self.params.nodes, lambda n: progress(0, f"{n:,} of {len(views.points):,} clouds"))
 
     def _solids(self, progress: PartProgress) -> list[SeenSolid]:
         p, solids = self.params, list[SeenSolid]()

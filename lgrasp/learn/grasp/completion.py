@@ -34,11 +34,21 @@ class Cubes(NamedTuple):
 
     half: torch.Tensor
     """Half of the side [m], (N,)."""
-    values: torch.Tensor
-    """What the network is given, (N, CHANNELS, n, n, n)."""
+    seen: torch.Tensor
+    """Distances from the nearest points in half sides, negative behind them, (N, n, n, n)."""
     base: torch.Tensor
-    """Signed distances in half sides of a first guess, (N, n, n, n): a cloud of one side is closed by its mirror image
-    behind the rim."""
+    """The same of a first guess: a cloud of one side is closed by its mirror image behind the rim."""
+    one_sided: torch.Tensor
+    """Length of the mean normal, (N,)."""
+
+    @property
+    def values(self) -> torch.Tensor:
+        """What the network is given, (N, CHANNELS, n, n, n)."""
+        n = self.seen.shape[-1]
+        near, height = 2 * _NEAR / n, torch.linspace(-1, 1, n, device=self.seen.device)
+        told = [(self.seen / near).clamp(-1, 1), (self.base / near).clamp(-1, 1), self.seen.abs()]
+        told += [x.expand_as(self.seen) for x in (height, self.one_sided[:, None, None, None])]
+        return torch.stack(told, 1)
 
     def some(self, index: torch.Tensor) -> "Cubes":
         """Some of them, by index, in single precision."""
@@ -59,28 +69,25 @@ def cubes_of(points: torch.Tensor, normals: torch.Tensor, count: int) -> Cubes:
     """
     half = _MARGIN * points.norm(dim=2).amax(1) + _PAD
     nodes = unit_nodes(count, points.device)
-    values, bases = [], []
-    for cloud, normal, h in zip(points, normals, half, strict=True):
-        away, seen = _distances(nodes * h, cloud, normal)
-        base, one_sided = seen, normal.mean(0).norm()
-        if one_sided > ONE_SIDED:
+    one_sided = normals.mean(1).norm(dim=1)
+    found = []
+    for cloud, normal, h, length in zip(points, normals, half, one_sided, strict=True):
+        base = seen = _distances(nodes * h, cloud, normal)
+        if length > ONE_SIDED:
             flip = torch.tensor([1.0, 1.0, -1.0], device=points.device)
             rim = torch.zeros(3, device=points.device)
             rim[2] = 2 * cloud[:, 2].quantile(_RIM)
-            base = seen.maximum(_distances(nodes * h, cloud * flip + rim, normal * flip)[1])
-        near = _NEAR * 2 * h / count
-        told = [(seen / near).clamp(-1, 1), (base / near).clamp(-1, 1), away / h, nodes[:, 2]]
-        values.append(torch.stack([*told, one_sided.expand(len(nodes))]))
-        bases.append(base / h)
-    shape = count, count, count
-    return Cubes(half, torch.stack(values).unflatten(2, shape), torch.stack(bases).unflatten(1, shape))
+            base = seen.maximum(_distances(nodes * h, cloud * flip + rim, normal * flip))
+        found.append(torch.stack([seen, base]) / h)
+    seen, base = torch.stack(found, 1).unflatten(2, (count, count, count))
+    return Cubes(half, seen, base, one_sided)
 
 
-def _distances(x: torch.Tensor, points: torch.Tensor, normals: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Distance of places x (m, 3) from the nearest point [m], and the same with the sign of its side."""
+def _distances(x: torch.Tensor, points: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
+    """Distance of places x (m, 3) from the nearest point [m], negative behind it."""
     found = [torch.cdist(part, points).min(1) for part in x.split(max(1, _BLOCK // len(points)))]
     away, which = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return away, away * ((x - points[which]) * normals[which]).sum(1).sign()
+    return torch.where(((x - points[which]) * normals[which]).sum(1) < 0, -away, away)
 
 
 class CompletionNet(nn.Module):

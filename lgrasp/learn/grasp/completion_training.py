@@ -1,6 +1,7 @@
 """Training of the completing network on views of solids whose distances are known."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 
 import torch
 from torch.nn import functional
@@ -34,19 +35,26 @@ class ViewSet:
         self.grids = DistanceGrids(grids, device=device)
         self.each = len(views) // len(grids)
 
-    def cubes(self, count: int) -> tuple[Cubes, torch.Tensor]:
-        """What the network is given of all views, and the objects' signed distances in half sides, (N, n, n, n); in
-        half precision, as they take much memory."""
-        nodes, parts = unit_nodes(count, self.points.device), []
-        for some in torch.arange(len(self.points), device=self.points.device).split(_AT_ONCE):
+    def cubes(self, count: int, made: Callable[[int], None] = lambda views: None) -> tuple[Cubes, torch.Tensor]:
+        """Cubes about all views, and the objects' signed distances in half sides, (N, n, n, n); in half precision, as
+        they take much memory. ``made`` is told how many there are."""
+        nodes, n = unit_nodes(count, self.points.device), len(self.points)
+
+        def room(*shape: int) -> torch.Tensor:
+            return torch.empty(n, *shape, dtype=torch.half, device=self.points.device)
+
+        grid = count, count, count
+        cubes_out, goals_out = Cubes(room(), room(*grid), room(*grid), room()), room(*grid)
+        for some in torch.arange(n, device=self.points.device).split(_AT_ONCE):
             cubes = cubes_of(self.points[some], self.normals[some], count)
             h = cubes.half[:, None, None]
             at = (nodes * h) @ self.R[some].mT + self.t[some, None]
             goal = self.grids.value(at, (some // self.each)[:, None]) / h[..., 0]
-            found = *cubes, goal.clamp(-_REACH, _REACH).reshape(cubes.base.shape)
-            parts.append([x.half() for x in found])
-        half, values, base, goal = (torch.cat(x) for x in zip(*parts, strict=True))
-        return Cubes(half, values, base), goal
+            goals_out[some] = goal.clamp(-_REACH, _REACH).reshape(cubes.base.shape).half()
+            for out, found in zip(cubes_out, cubes, strict=True):
+                out[some] = found.half()
+            made(int(some[-1]) + 1)
+        return cubes_out, goals_out
 
 
 def solid_views(solids: Sequence[SeenSolid], device: torch.device | str) -> ViewSet:
@@ -54,22 +62,29 @@ def solid_views(solids: Sequence[SeenSolid], device: torch.device | str) -> View
     return ViewSet([view for solid in solids for view in solid.views], [solid.grid for solid in solids], device)
 
 
-def fit_completion(net: CompletionNet, views: ViewSet, p: GraspParams, training: Training) -> LossCurve:
-    """Train a network in place, as phase ``completion`` of a training; the loss along it.
+def fit_completion(
+    net: CompletionNet,
+    examples: Callable[[], tuple[Cubes, torch.Tensor]],
+    p: GraspParams,
+    training: Training,
+) -> LossCurve:
+    """Train a network in place, as phase ``completion`` of a training; the loss along it. ``examples`` are
+    :meth:`ViewSet.cubes`, made if a step is left.
 
     Cubes are turned by right angles about z and mirrored at random.
     """
-    cubes, goals = views.cubes(p.nodes)
+    given = cache(examples)
     convert_conv3d_weight_memory_format(net.train(), torch.channels_last_3d)
     optimiser = torch.optim.AdamW(net.parameters(), lr=p.completion_rate, weight_decay=1e-4)
     draw, curve = torch.Generator().manual_seed(p.seed), LossCurve(p.completion_steps)
 
     def loss(_: int) -> tuple[torch.Tensor, torch.Tensor]:
+        cubes, goals = given()
         chosen = torch.randint(len(goals), (p.completion_batch,), generator=draw).to(goals.device)
         turn, mirror = (int(torch.randint(n, (), generator=draw)) for n in (4, 2))
-        given = Cubes(*(_turned(x, turn, mirror) for x in cubes.some(chosen)))
+        turned = Cubes(*(_turned(x, turn, mirror) for x in cubes.some(chosen)))
         goal = _turned(goals[chosen].float(), turn, mirror)
-        found = completion_loss(net(given), goal, p.nodes)
+        found = completion_loss(net(turned), goal, p.nodes)
         return found, found
 
     descent = Descent(optimiser, falling_rate(optimiser, p.completion_steps, _WARM), clip=1.0)
