@@ -168,7 +168,7 @@ def test_surfaces_are_those_of_their_shares():
 
 
 def test_solids_are_seen_as_cameras_see_them(monkeypatch):
-    solids = random_solids(0, range(2), 64)
+    solids = list(random_solids(0, range(2), 64))
     assert [len(solid.views) for solid in solids] == [VIEWS] * 2
     monkeypatch.setattr("lgrasp.learn.grasp.solids._A_PROCESS", 1)
     monkeypatch.setattr("lgrasp.learn.grasp.solids.ProcessPool", ThreadPoolExecutor)

@@ -3,8 +3,9 @@ what its plans are worth on the true meshes of objects, from clouds of them."""
 
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -89,7 +90,12 @@ class GraspJob(GraspRequest, NetworkJob):
         return Made(part.rows, predictor_bytes(made))
 
     def made_before(self) -> list[str]:
-        return [f"solids {first}" for first in range(0, self.params.shapes, _SOLIDS)]
+        return list(self._parts())
+
+    def _parts(self) -> dict[str, range]:
+        """Numbers of the solids that are kept together, by name."""
+        shapes = self.params.shapes
+        return {f"solids {k}": range(k, min(k + _SOLIDS, shapes)) for k in range(0, shapes, _SOLIDS)}
 
     def _cubes(self, progress: PartProgress) -> tuple[Cubes, torch.Tensor]:
         """What completing is learnt from."""
@@ -97,15 +103,21 @@ class GraspJob(GraspRequest, NetworkJob):
         return views.cubes(self.params.nodes, lambda n: progress(0, f"{n:,} of {len(views.points):,} clouds"))
 
     def _solids(self, progress: PartProgress) -> list[SeenSolid]:
-        p, solids = self.params, list[SeenSolid]()
-        for name in self.made_before():
-            numbers = range(len(solids), min(len(solids) + _SOLIDS, p.shapes))
+        p, parts = self.params, self._parts()
+        there = {name for name in parts if self.has_kept(name)}
+        missing = [number for name, numbers in parts.items() if name not in there for number in numbers]
+        solids: list[SeenSolid] = []
+        with closing(random_solids(p.seed, missing, p.cloud)) as makes:
+            for name, numbers in parts.items():
 
-            def told(made: int, first: int = numbers.start) -> None:
-                progress(0, f"{first + made:,} of {p.shapes:,} solids")
+                def make(numbers: range = numbers, damaged: bool = name in there) -> dict[str, np.ndarray]:
+                    found = []
+                    for solid in random_solids(p.seed, numbers, p.cloud) if damaged else islice(makes, len(numbers)):
+                        found.append(solid)
+                        progress(0, f"{numbers.start + len(found):,} of {p.shapes:,} solids")
+                    return solid_arrays(found)
 
-            make = partial(random_solids, p.seed, numbers, p.cloud, told)
-            solids += solids_of(self.kept(name, lambda make=make: solid_arrays(make())))
+                solids += solids_of(self.kept(name, make))
         return solids
 
     def _examples(self) -> tuple[HandModel, list[ObjectRecord], SequenceSteps, ViewSet]:

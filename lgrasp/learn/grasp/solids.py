@@ -1,6 +1,6 @@
 """Views of random solids, from which completing is learnt."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple, get_args
 
@@ -41,25 +41,15 @@ def random_solid(seed: int, number: int, points: int) -> SeenSolid:
     return SeenSolid(views, coarse_grid(vertices, faces, closed=True))
 
 
-def random_solids(
-    seed: int, numbers: range, points: int, made: Callable[[int], None] = lambda done: None
-) -> list[SeenSolid]:
-    """Those of some numbers, by as many processes as there are cores; few are made here. ``made`` is told how many
-    there are."""
-    solids: list[SeenSolid] = []
-
-    def keep(found: Iterable[SeenSolid]) -> list[SeenSolid]:
-        for solid in found:
-            solids.append(solid)
-            made(len(solids))
-        return solids
-
+def random_solids(seed: int, numbers: Sequence[int], points: int) -> Generator[SeenSolid]:
+    """Those of some numbers, by as many processes as there are cores; few are made here."""
     make, count = partial(random_solid, seed, points=points), len(numbers)
     if count < _A_PROCESS:
-        return keep(make(number) for number in numbers)
+        yield from map(make, numbers)
+        return
     with none_killed("makes solids"), ProcessPool(min(cores(), count // _A_PROCESS)) as pool:
-        waiting = [pool.submit(make, number) for number in numbers]
-        return keep(future.result() for future in waiting)
+        for future in [pool.submit(make, number) for number in numbers]:
+            yield future.result()
 
 
 def solid_arrays(solids: Sequence[SeenSolid]) -> dict[str, np.ndarray]:
