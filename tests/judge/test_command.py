@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from support.jawshard import URDF, row, write_shard
 from support.places import ROOT
+from support.shards import sample_shard
 from typer.testing import CliRunner
 
+from lgrasp.dataset.writer import write_shard as save
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.run import judge
+from lgrasp.judge.shard import check_members
 from lgrasp.runtime.kernels import import_all
 from lgrasp_cli.main import app
 
@@ -164,6 +167,9 @@ MENDS = {
     "sizes are positive": lambda f: _replace(f, "hand/urdf", URDF.replace('radius="0.004"', 'radius="-1"')),
     "not in the shard": lambda f: f.__delitem__("hand/meshes"),
     "base link": lambda f: f["hand"].attrs.__setitem__("base_link", "arm"),
+    "groups inside each other": lambda f: f.create_group("g" + "/g" * 60),
+    "'hand/again/again.*groups": lambda f: f.__setitem__("hand/again", f["hand"]),
+    "text_sha256 differs": lambda f: f.attrs.__setitem__("text_sha256", "0" * 64),
 }
 
 
@@ -175,6 +181,38 @@ def test_files_that_cannot_be_judged(tmp_path, what):
         judge(path)
     assert str(path) in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("member", ["hand", "hand/meshes/0", "objects/a_cube", "grasps/q", "statistics"])
+def test_links_are_not_followed(tmp_path, member):
+    """Neither to another file nor inside this one; members that the judge does not read must not be links either."""
+    whole = write_shard(tmp_path / "whole.h5", [row()])
+    for link in (h5py.ExternalLink(str(whole), f"/{member}"), h5py.SoftLink("/aside")):
+        path = write_shard(tmp_path / "s.h5", [row()])
+        with h5py.File(path, "r+") as f:
+            if member in f:
+                f.move(member, "aside")
+            f[member] = link
+        result = run(path)
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert result.stderr == f"error: {path}: '{member}' is a link; a shard holds its own data\n"
+
+
+def test_changed_texts_are_found(tmp_path):
+    """A shard as lgrasp writes it keeps its checksum; with a changed attribute or URDF it is refused."""
+    path = tmp_path / "s.h5"
+    save(path, sample_shard(5, joints=4))
+    with h5py.File(path) as f:
+        check_members(f)
+    for change in (
+        lambda f: f["objects/cup"].attrs.__setitem__("scale", 2.0),
+        lambda f: _replace(f, "hand/urdf", f["hand/urdf"].asstr()[()] + " "),
+    ):
+        save(path, sample_shard(5, joints=4))
+        with h5py.File(path, "r+") as f:
+            change(f)
+        with pytest.raises(JudgeError, match="text_sha256 differs"):
+            judge(path)
 
 
 def test_no_shard_at_all(tmp_path):
