@@ -16,6 +16,7 @@ import trimesh
 
 from lgrasp.judge.bounds import LIMIT_EXCESS, MOST, MU, UNIT_NORMAL, JudgeError
 from lgrasp.judge.collision import POSTURES, JudgedHand, JudgedObject
+from lgrasp.judge.files import existing
 from lgrasp.judge.meshes import clean_mesh, load_mesh
 from lgrasp.judge.steer import Asked, JudgedRegions, read_asked
 
@@ -252,7 +253,7 @@ def read_shard(path: Path, urdf: Path | None = None, mesh: Mapping[str, Path] | 
     Raises:
         JudgeError: the file is damaged, foreign, not whole or cannot be judged; the message names it.
     """
-    check_strings(path)
+    check_strings(existing(path))
     try:
         with h5py.File(path, "r", locking=False) as f:
             return _read(f, path, urdf, mesh or {})

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from lgrasp.dataset.writer import write_shard as save
 from lgrasp.judge.bounds import JudgeError
+from lgrasp.judge.checks import RowChecks
 from lgrasp.judge.run import judge
 from lgrasp.judge.shard import check_members
 from lgrasp.runtime.kernels import import_all
@@ -229,6 +230,39 @@ def test_no_shard_at_all(tmp_path):
         assert not result.stdout
     assert run(tmp_path / "s.h5", "--rows", 0).exit_code == 2
     assert run(tmp_path / "s.h5", "--json", "/proc/no/out.json").exit_code == 2
+
+
+def test_files_of_a_folder_that_cannot_be_judged_are_left_out(tmp_path, monkeypatch):
+    """With one line, and exit code 2 whatever the verdict on the others; one that was named is an error."""
+
+    def checks(shard, *args, **options):
+        if shard.path.name == "late.h5":
+            raise ValueError("numbers that no check expects")
+        return RowChecks(shard, *args, **options)
+
+    write_shard(tmp_path / "good.h5", [row()])
+    (tmp_path / "gone.h5").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe.h5")
+    write_shard(tmp_path / "late.h5", [row()])
+    monkeypatch.setattr(sys.modules["lgrasp.judge.run"], "RowChecks", checks)
+    (tmp_path / "text.h5").write_text("no shard")
+    result = run(tmp_path, "--json", tmp_path / "out.json")
+    assert result.exit_code == 2
+    assert "1 of 1 judged rows (100.00 %)" in result.stdout
+    assert result.stderr.splitlines()[-1].startswith(
+        f"warning: 4 of 5 files are left out, first {tmp_path / 'gone.h5'}: no such file"
+    )
+    assert result.stderr.count("\n") == 1
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert (len(found["shards"]), len(found["left_out"])) == (1, 4)
+    assert not judge(tmp_path).passed
+    named = run(tmp_path, tmp_path / "text.h5")
+    assert (named.exit_code, named.stdout) == (2, "")
+    assert named.stderr.startswith(f"error: {tmp_path / 'text.h5'}: ")
+    (tmp_path / "good.h5").rename(tmp_path / "late.h5")
+    none = run(tmp_path)
+    assert (none.exit_code, none.stdout) == (2, "")
+    assert none.stderr.startswith(f"error: {tmp_path / 'gone.h5'}: no such file")
 
 
 def test_damaged_string_heaps_are_found_before_they_are_read(tmp_path):
