@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 from typer import Option
 
-from lgrasp.choices import FieldIndex
+from lgrasp.choices import MOST_BATCH, FieldIndex
 from lgrasp.notices import notice
 from lgrasp.words import number
 from lgrasp_cli.names import one_of
@@ -139,7 +139,7 @@ def _up_to(stage: str):
         mesh: Mesh,
         hand: Hand = "allegro",
         pipeline: PipelineName = usual,
-        candidates: Annotated[int, Option(min=1, help="Candidates in the batch.")] = 1024,
+        candidates: Annotated[int, Option(min=1, max=MOST_BATCH, help="Candidates in the batch.")] = 1024,
         first: Annotated[int, Option(min=0, help="First candidate of the batch.")] = 0,
         shard: Annotated[int, Option(min=0, help="Shard whose candidate stream is used.")] = 0,
         seed: Seed = None,
