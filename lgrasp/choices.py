@@ -1,7 +1,11 @@
-"""Names of which one is chosen, as types: parameters, configs and options of the command line take the same ones."""
+"""Names of which one is chosen, as types, and largest numbers: parameters, configs and commands take the same ones."""
 
 from typing import Literal, get_args
 
+MOST_ROWS = 10_000_000
+"""Rows, or starts, of one file."""
+MOST_BATCH = 1 << 20
+"""Candidates of a batch, twice as many as a GPU gets unasked."""
 Method = Literal["field", "anneal", "mala", "diffuser"]
 """How a sequence continues with the next object."""
 NetworkName = Literal["coarse", "diffuser", "grasp", "pose"]

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from typer import Option
 
-from lgrasp.choices import PalmUse, ScoreName, ThumbPlace
+from lgrasp.choices import MOST_BATCH, PalmUse, ScoreName, ThumbPlace
 from lgrasp.words import plural
 from lgrasp_cli.many import run_all, show_plans
 from lgrasp_cli.names import GRASP_TYPE, HANDS, OBJECTS, one_of
@@ -110,7 +110,7 @@ def generate(
     seed: Seed = None,
     contacts: Contacts = None,
     scale: Scale = 1.0,
-    batch: Annotated[int, Option(min=0, help="Candidates per batch; 0: as suits the device.")] = 0,
+    batch: Annotated[int, Option(min=0, max=MOST_BATCH, help="Candidates per batch; 0: as suits the device.")] = 0,
     simulate: Simulate = None,
     shard_rows: Annotated[
         int,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 from typer import Argument, Option
 
-from lgrasp.choices import ProtocolName, VariationName
+from lgrasp.choices import MOST_ROWS, ProtocolName, VariationName
 from lgrasp.words import plural
 from lgrasp_cli.look import view_hand
 from lgrasp_cli.names import HANDS, OBJECTS, PIPELINE, one_of
@@ -149,7 +149,7 @@ def add_hand(
 def check_hand(
     name: HandArgument,
     out: Annotated[Path | None, Option(help="Folder of the pictures; default: check/NAME.")] = None,
-    rows: Annotated[int, Option("-n", "--rows", min=1, help="Grasps requested per object.")] = 200,
+    rows: Annotated[int, Option("-n", "--rows", min=1, max=MOST_ROWS, help="Grasps requested per object.")] = 200,
     pipeline: PipelineName = "robust",
     device: Device = "auto",
     workers: Workers = 0,

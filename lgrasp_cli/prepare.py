@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 from typer import Option
 
-from lgrasp.choices import FieldIndex
+from lgrasp.choices import MOST_BATCH, FieldIndex
 from lgrasp.notices import notice
 from lgrasp.words import number
 from lgrasp_cli.names import one_of
@@ -113,7 +113,7 @@ def warm_up(device: Device = "auto", cache_dir: CacheDir = None) -> None:
     import_all()
     modules = kernel_modules()
     with Bar() as bar:
-        if words := first_time(chosen.alias):
+        if words := first_time(chosen.alias, modules):
             bar.say(words)
         load_kernels(chosen.alias, modules, bar.share, preparing=True)
     typer.echo(f"{len(modules)} modules ready on {chosen.alias} ({chosen.name})")
@@ -139,7 +139,7 @@ def _up_to(stage: str):
         mesh: Mesh,
         hand: Hand = "allegro",
         pipeline: PipelineName = usual,
-        candidates: Annotated[int, Option(min=1, help="Candidates in the batch.")] = 1024,
+        candidates: Annotated[int, Option(min=1, max=MOST_BATCH, help="Candidates in the batch.")] = 1024,
         first: Annotated[int, Option(min=0, help="First candidate of the batch.")] = 0,
         shard: Annotated[int, Option(min=0, help="Shard whose candidate stream is used.")] = 0,
         seed: Seed = None,

@@ -37,18 +37,19 @@ _LOST = {
 
 
 def starving_stage(counts: dict[str, dict[str, int]]) -> tuple[str, str]:
-    """The stage with the smallest share of survivors, by the ``counts`` of stages, and a sentence on it."""
+    """The stage with the smallest share of survivors, by the ``counts`` of stages, and a sentence on it.
+
+    Of what few reached the share is hardly known: one more is counted as tried and as surviving.
+    """
     worst, least, words = "place", 2.0, "nothing was tried"
     for stage, before, after, reason in _STEPS:
         found = counts.get(stage)
         whole = (found.get(before, 0) if before else sum(found.values())) if found else 0
         if not found or not whole:
             continue
-        share = found.get(after, 0) / whole
+        share = (found.get(after, 0) + 1) / (whole + 1)
         reason = next((words for name, words in _LOST.items() if 2 * found.get(name, 0) > whole), reason)
         if share < least:
             worst, least = stage, share
             words = f"{found.get(after, 0):,} of {whole:,} survive: {reason}"
-        if share == 0.0:
-            break
     return worst, words

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from pydantic import Field, model_validator
 
-from lgrasp.choices import ProtocolName
+from lgrasp.choices import MOST_BATCH, MOST_ROWS, ProtocolName
 from lgrasp.config import (
     DeviceName,
     HandNames,
@@ -60,8 +60,8 @@ class JobConfig(Params):
     out: Path = Field(Path("grasps"), description="Folder for the folders HAND-OBJECT/PIPELINE.")
     device: DeviceName = "auto"
     workers: Workers = 0
-    batch: int = Field(0, ge=0)
-    shard_rows: int = Field(10_000, ge=1)
+    batch: int = Field(0, ge=0, le=MOST_BATCH)
+    shard_rows: int = Field(10_000, ge=1, le=MOST_ROWS)
     passes: int | None = Field(None, ge=1, le=64)
     negatives: Negatives = 0.0
     simulate: ProtocolName | None = Field(None, description="Protocol that grasps must pass to be kept.")

@@ -31,7 +31,7 @@ def judge(
 
     It shares no code with the generator and trusts no stored number. Rows marked invalid are counted separately.
 
-    Exit code: 0 if every row is strictly valid, 1 if not, 2 for a file that cannot be judged.
+    Exit code: 0 if every row is strictly valid, 1 if not, 2 if some file cannot be judged.
 
     \b
     Example: lgrasp judge grasps
@@ -49,14 +49,14 @@ def judge(
 
         if json_path and json_path != "-":
             check_report(json_path)
-        files = find_shards(shards)
+        files = len(find_shards(shards))
         for path in (*meshes.values(), *([urdf] if urdf else ())):
             existing(path)
         from lgrasp.judge import run
 
         progress = None if quiet else _Progress()
         try:
-            report = run.judge(files, urdf=urdf, mesh=meshes or None, rows=rows, progress=progress)
+            report = run.judge(shards, urdf=urdf, mesh=meshes or None, rows=rows, progress=progress)
         finally:
             if progress:
                 progress.close()
@@ -69,11 +69,13 @@ def judge(
     except OSError as error:
         typer.echo(f"error: {error.filename or json_path}: {error.strerror}", err=True)
         raise typer.Exit(2) from error
+    if out := report.left_out:
+        typer.echo(f"warning: {len(out)} of {files} files are left out, first {' '.join(out[0].split())}", err=True)
     if json_path == "-":
         typer.echo(text)
     elif not quiet:
         typer.echo(str(report))
-    raise typer.Exit(0 if report.passed else 1)
+    raise typer.Exit(2 if report.left_out else 0 if report.passed else 1)
 
 
 class _Progress:

@@ -11,7 +11,8 @@ from lgrasp.judge.bounds import JudgeError
 
 
 def find_shards(given: Sequence[str | Path]) -> list[Path]:
-    """Files, and every ``*.h5`` in folders at any depth, each once; links are followed.
+    """Files, and every ``*.h5`` in folders at any depth, each once; links are followed. It may be that
+    those in folders cannot be read.
 
     Raises:
         JudgeError: no such file or folder, or a folder without shards.
@@ -21,7 +22,7 @@ def find_shards(given: Sequence[str | Path]) -> list[Path]:
         files = _inside(path) if path.is_dir() else [path]
         if not files:
             raise JudgeError(f"{path}: no shard (*.h5) in this folder")
-        found += map(existing, files)
+        found += files
     once: dict[Path, Path] = {}
     for path in found:
         once.setdefault(path.resolve(), path)

@@ -85,15 +85,24 @@ class Report(JudgedRows):
         seconds, seconds_load: time of the checks, and of reading and preparing hands and objects.
         rows: judged.
         valid_share: of the judged rows that the files do not call invalid themselves.
-        passed: whether there are such rows and all are strictly valid.
+        left_out: why files in folders could not be judged, a line each.
+        passed: whether there are such rows, all are strictly valid, and no file was left out.
         failures: rows failing each check; a row may fail several.
         self_pairs: pairs of links with self-penetration beyond the bound and their rows, most first.
         distributions: largest, 99th percentile and median of each recomputed number.
         metrics: those of the deviations of stored metrics from recomputed numbers.
     """
 
-    def __init__(self, shards: Sequence[ShardVerdict], repeats: Repeats, seconds: float, seconds_load: float) -> None:
+    def __init__(
+        self,
+        shards: Sequence[ShardVerdict],
+        repeats: Repeats,
+        seconds: float,
+        seconds_load: float,
+        left_out: Sequence[str] = (),
+    ) -> None:
         self.shards, self.repeats, self.seconds, self.seconds_load = tuple(shards), repeats, seconds, seconds_load
+        self.left_out = tuple(left_out)
         super().__init__(
             total_rows=sum(s.total_rows for s in shards),
             kept_invalid=np.concatenate([s.kept_invalid for s in shards]),
@@ -104,7 +113,7 @@ class Report(JudgedRows):
         claimed = ~self.kept_invalid
         self.rows = len(self.valid)
         self.valid_share = float(self.valid[claimed].mean()) if claimed.any() else 0.0
-        self.passed = self.valid_share == 1.0
+        self.passed = self.valid_share == 1.0 and not self.left_out
         self.failures = {k: int((v & claimed).sum()) for k, v in self.failed.items()}
         self.self_pairs = dict(sum((s.self_pairs for s in shards), Counter()).most_common())
         self.distributions = _spread(self.values)
@@ -130,6 +139,7 @@ class Report(JudgedRows):
             **self.counts(),
             **{name: getattr(self, name) for name in same},
             "shards": [s.to_dict() for s in self.shards],
+            "left_out": list(self.left_out),
             "stored_metrics": self.metrics,
             "near_duplicates": self.repeats.near,
             "near_duplicate_share": self.repeats.near / max(self.total_rows, 1),

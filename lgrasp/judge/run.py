@@ -6,8 +6,9 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from lgrasp.judge.files import existing, find_shards
 from lgrasp.judge.report import Report, ShardVerdict
 from lgrasp.judge.shard import JudgedShard, not_judged, read_shard
 
+T = TypeVar("T")
 BLOCK = 64
 EPSILON_ROWS = 128
 """Ferrari-Canny is recomputed for this many rows of a shard that stores it."""
@@ -39,20 +41,37 @@ def judge(
         mesh: original object mesh in place of the stored one (times the stored scale), or meshes by object id.
         rows: judge only this many rows, drawn at random with a fixed seed; duplicates and poses are of all rows.
 
+    Files in folders that cannot be judged are left out; the report names them, and is not passed.
+
     Raises:
-        JudgeError: nothing to judge, or a file that cannot be judged.
+        JudgeError: nothing to judge, or a file that was named and cannot be judged.
     """
     if hasattr(shards, "save"):
         with tempfile.TemporaryDirectory() as folder:
             shards.save(path := Path(folder) / "grasps.h5")
             return judge(path, urdf=urdf, mesh=mesh, rows=rows, progress=progress)
-    paths = find_shards([shards] if isinstance(shards, str | Path) else shards)
+    given = [shards] if isinstance(shards, str | Path) else list(shards)
+    paths, named, left_out = find_shards(given), {Path(path).resolve() for path in given}, list[str]()
     if rows is not None and rows < 1:
         raise JudgeError(f"rows {rows}: at least 1")
     meshes = {} if mesh is None else mesh if isinstance(mesh, Mapping) else {"": mesh}
     start = time.perf_counter()
     sources = {k: existing(p) for k, p in meshes.items()}
-    read = [read_shard(p, None if urdf is None else existing(urdf), sources) for p in paths]
+    original = None if urdf is None else existing(urdf)
+
+    def sound(path: Path, make: Callable[[], T]) -> list[T]:
+        """What is made of a file; nothing where it was found in a folder and cannot be judged."""
+        try:
+            return [make()]
+        except JudgeError as error:
+            if path.resolve() in named:
+                raise
+            left_out.append(str(error))
+            return []
+
+    read = [shard for p in paths for shard in sound(p, partial(read_shard, p, original, sources))]
+    if not read:
+        raise JudgeError(left_out[0])
     known = {name for s in read for name in s.object_ids}
     if unknown := [name for name in sources if name and name not in known]:
         raise JudgeError(f"mesh of object '{unknown[0]}': the shards hold {', '.join(sorted(known))}")
@@ -67,9 +86,19 @@ def judge(
     verdicts, done = [], 0
     for s, first in zip(read, np.cumsum([0, *counts]), strict=False):
         mine = chosen[(chosen >= first) & (chosen < first + len(s.kept_invalid))] - first
-        verdicts.append(_judge_shard(s, mine, lambda n, done=done: progress and progress(done + n, len(chosen))))
+        step = partial(_step, progress, done, len(chosen))
+        verdicts += sound(s.path, partial(_judge_shard, s, mine, step))
         done += len(mine)
-    return Report(verdicts, count_repeats(read), time.perf_counter() - loaded, loaded - start)
+    if not verdicts:
+        raise JudgeError(left_out[0])
+    judged = {verdict.path for verdict in verdicts}
+    repeats = count_repeats([s for s in read if s.path in judged])
+    return Report(verdicts, repeats, time.perf_counter() - loaded, loaded - start, left_out)
+
+
+def _step(progress: Callable[[int, int], None] | None, before: int, total: int, done: int) -> None:
+    if progress:
+        progress(before + done, total)
 
 
 def _judge_shard(shard: JudgedShard, rows: np.ndarray, step: Callable[[int], object]) -> ShardVerdict:

@@ -16,11 +16,14 @@ import trimesh
 
 from lgrasp.judge.bounds import LIMIT_EXCESS, MOST, MU, UNIT_NORMAL, JudgeError
 from lgrasp.judge.collision import POSTURES, JudgedHand, JudgedObject
+from lgrasp.judge.files import existing
 from lgrasp.judge.meshes import clean_mesh, load_mesh
 from lgrasp.judge.steer import Asked, JudgedRegions, read_asked
 
 MOST_BYTES = 4 << 30
 """Of one dataset."""
+MOST_GROUPS = 8
+"""Inside each other."""
 COLUMNS: dict[str, tuple[str, ...]] = {
     "q": ("K",),
     "q_pregrasp": ("K",),
@@ -90,6 +93,39 @@ def _cached(key: str, make: Callable[[], Any]) -> Any:
 
 def _text(value: Any) -> str:
     return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def check_members(file: h5py.File) -> None:
+    """Check that a file holds all of its groups and datasets itself, and the attributes and texts that it was written
+    with, if it has their checksum.
+
+    Raises:
+        JudgeError: a link, groups inside each other without end, or a text that was changed.
+    """
+    found: dict[str, h5py.Group | h5py.Dataset] = {"": file}
+    texts: dict[str, Any] = {}
+    todo = [""]
+    while todo:
+        path = todo.pop()
+        for name in (group := found[path]):
+            here = f"{path}/{name}" if path else name
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise JudgeError(f"{here!r} is a link; a shard holds its own data")
+            found[here] = member = group[name]
+            if isinstance(member, h5py.Group):
+                if here.count("/") >= MOST_GROUPS:
+                    raise JudgeError(f"{here!r}: more than {MOST_GROUPS} groups inside each other")
+                todo.append(here)
+            elif isinstance(member, h5py.Dataset) and member.shape == () and h5py.check_string_dtype(member.dtype):
+                texts[here] = _text(_array(group, name))
+    if (told := file.attrs.get("text_sha256")) is None:
+        return
+    for path, member in found.items():
+        texts |= {f"{path}@{k}": v.tolist() if hasattr(v, "tolist") else v for k, v in member.attrs.items()}
+    del texts["@text_sha256"]
+    document = json.dumps(texts, sort_keys=True, separators=(",", ":"), default=str)
+    if told != hashlib.sha256(document.encode()).hexdigest():
+        raise JudgeError("attributes or texts were changed after writing: text_sha256 differs")
 
 
 def _array(group: h5py.Group, name: str) -> np.ndarray:
@@ -217,7 +253,7 @@ def read_shard(path: Path, urdf: Path | None = None, mesh: Mapping[str, Path] | 
     Raises:
         JudgeError: the file is damaged, foreign, not whole or cannot be judged; the message names it.
     """
-    check_strings(path)
+    check_strings(existing(path))
     try:
         with h5py.File(path, "r", locking=False) as f:
             return _read(f, path, urdf, mesh or {})
@@ -241,6 +277,7 @@ def _read(f: h5py.File, path: Path, urdf: Path | None, mesh: Mapping[str, Path])
         )
     if not np.array_equal(attrs["complete"], 1):
         raise JudgeError("incomplete: attribute complete is not 1")
+    check_members(f)
     for name in ("hand", "objects", "grasps"):
         if not isinstance(f.get(name), h5py.Group) or not len(f[name]):
             raise JudgeError(f"no group {name}, or nothing in it")

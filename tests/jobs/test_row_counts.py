@@ -41,6 +41,14 @@ def test_a_stage_that_nothing_reached_is_not_blamed():
     assert starving_stage(counts)[0] == "adjust"
 
 
+def test_a_stage_that_few_reached_is_not_blamed():
+    """Real barrett with a screwdriver on a table; then ten that reached the filter, which does tell."""
+    few = {"ik": {"tried": 30_000, "kept": 17_530}, "search": {"poses": 5_000, "yielding": 1}}
+    assert starving_stage(few | {"filter": {"kept": 0, "table": 1}})[0] == "search"
+    some = {"search": {"poses": 50, "yielding": 10}, "filter": {"kept": 0, "table": 10}}
+    assert starving_stage(some)[0] == "filter"
+
+
 def test_the_reason_of_most_lost_grasps_is_told():
     for lost, words in (
         ("contact", "bounds.max_gap"),

@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 from support.jawshard import URDF, row, write_shard
 from support.places import ROOT
+from support.shards import sample_shard
 from typer.testing import CliRunner
 
+from lgrasp.dataset.writer import write_shard as save
 from lgrasp.judge.bounds import JudgeError
+from lgrasp.judge.checks import RowChecks
 from lgrasp.judge.run import judge
+from lgrasp.judge.shard import check_members
 from lgrasp.runtime.kernels import import_all
 from lgrasp_cli.main import app
 
@@ -164,6 +168,9 @@ MENDS = {
     "sizes are positive": lambda f: _replace(f, "hand/urdf", URDF.replace('radius="0.004"', 'radius="-1"')),
     "not in the shard": lambda f: f.__delitem__("hand/meshes"),
     "base link": lambda f: f["hand"].attrs.__setitem__("base_link", "arm"),
+    "groups inside each other": lambda f: f.create_group("g" + "/g" * 60),
+    "'hand/again/again.*groups": lambda f: f.__setitem__("hand/again", f["hand"]),
+    "text_sha256 differs": lambda f: f.attrs.__setitem__("text_sha256", "0" * 64),
 }
 
 
@@ -175,6 +182,38 @@ def test_files_that_cannot_be_judged(tmp_path, what):
         judge(path)
     assert str(path) in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("member", ["hand", "hand/meshes/0", "objects/a_cube", "grasps/q", "statistics"])
+def test_links_are_not_followed(tmp_path, member):
+    """Neither to another file nor inside this one; members that the judge does not read must not be links either."""
+    whole = write_shard(tmp_path / "whole.h5", [row()])
+    for link in (h5py.ExternalLink(str(whole), f"/{member}"), h5py.SoftLink("/aside")):
+        path = write_shard(tmp_path / "s.h5", [row()])
+        with h5py.File(path, "r+") as f:
+            if member in f:
+                f.move(member, "aside")
+            f[member] = link
+        result = run(path)
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert result.stderr == f"error: {path}: '{member}' is a link; a shard holds its own data\n"
+
+
+def test_changed_texts_are_found(tmp_path):
+    """A shard as lgrasp writes it keeps its checksum; with a changed attribute or URDF it is refused."""
+    path = tmp_path / "s.h5"
+    save(path, sample_shard(5, joints=4))
+    with h5py.File(path) as f:
+        check_members(f)
+    for change in (
+        lambda f: f["objects/cup"].attrs.__setitem__("scale", 2.0),
+        lambda f: _replace(f, "hand/urdf", f["hand/urdf"].asstr()[()] + " "),
+    ):
+        save(path, sample_shard(5, joints=4))
+        with h5py.File(path, "r+") as f:
+            change(f)
+        with pytest.raises(JudgeError, match="text_sha256 differs"):
+            judge(path)
 
 
 def test_no_shard_at_all(tmp_path):
@@ -191,6 +230,39 @@ def test_no_shard_at_all(tmp_path):
         assert not result.stdout
     assert run(tmp_path / "s.h5", "--rows", 0).exit_code == 2
     assert run(tmp_path / "s.h5", "--json", "/proc/no/out.json").exit_code == 2
+
+
+def test_files_of_a_folder_that_cannot_be_judged_are_left_out(tmp_path, monkeypatch):
+    """With one line, and exit code 2 whatever the verdict on the others; one that was named is an error."""
+
+    def checks(shard, *args, **options):
+        if shard.path.name == "late.h5":
+            raise ValueError("numbers that no check expects")
+        return RowChecks(shard, *args, **options)
+
+    write_shard(tmp_path / "good.h5", [row()])
+    (tmp_path / "gone.h5").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe.h5")
+    write_shard(tmp_path / "late.h5", [row()])
+    monkeypatch.setattr(sys.modules["lgrasp.judge.run"], "RowChecks", checks)
+    (tmp_path / "text.h5").write_text("no shard")
+    result = run(tmp_path, "--json", tmp_path / "out.json")
+    assert result.exit_code == 2
+    assert "1 of 1 judged rows (100.00 %)" in result.stdout
+    assert result.stderr.splitlines()[-1].startswith(
+        f"warning: 4 of 5 files are left out, first {tmp_path / 'gone.h5'}: no such file"
+    )
+    assert result.stderr.count("\n") == 1
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert (len(found["shards"]), len(found["left_out"])) == (1, 4)
+    assert not judge(tmp_path).passed
+    named = run(tmp_path, tmp_path / "text.h5")
+    assert (named.exit_code, named.stdout) == (2, "")
+    assert named.stderr.startswith(f"error: {tmp_path / 'text.h5'}: ")
+    (tmp_path / "good.h5").rename(tmp_path / "late.h5")
+    none = run(tmp_path)
+    assert (none.exit_code, none.stdout) == (2, "")
+    assert none.stderr.startswith(f"error: {tmp_path / 'gone.h5'}: no such file")
 
 
 def test_damaged_string_heaps_are_found_before_they_are_read(tmp_path):

@@ -26,6 +26,8 @@ hands show alegro
 hands show no/such.urdf
 hands check alegro
 hands check allegro --device gpu
+hands check allegro -n 1000000000000
+hands compare allegro leap -n 1000000000000
 hands add no/such.urdf
 objects show mugg
 pipelines show robsut
@@ -48,6 +50,8 @@ generate --object mug --out x -n 1e12
 generate --object mug --out x -n 1000000000000
 generate --object mug --scale 0
 generate --object mug --out x --shard-rows 0
+generate --object mug --out x -n 1000000000000 --shard-rows 1000000000000
+generate --object mug --out x --batch 1000000000000
 generate --object mug --out /proc/x
 generate --object mug --json /proc/x/report.json
 generate --object mug --num-shards 0
@@ -57,12 +61,14 @@ sequence mug
 sequence mug sphere --method feild
 sequence mug sphere --simulate seq7
 sequence mug sphere -n 0
+sequence mug sphere -n 1000000000000 --shard-rows 1000000000000
 sequence mug sphere --scale a:b
 plan --object mugg
 plan --object mug --hand alegro
 plan --object mug --cloud cloud.ply
 plan --cloud no/such.ply
 plan --object mug --starts 0
+plan --object mug -n 1000000000000
 plan --object mug --set plan.finalist=5
 refine no-folder --out x
 refine no-folder --out x --from isaacgrasp
@@ -90,6 +96,7 @@ preprocess mugg
 warm-up --device gpu
 place --object mugg
 filter --object mug --candidates 0
+filter --object mug --candidates 1000000000000
 dataset info no-folder
 dataset check no-folder
 dataset merge no-folder -o x.h5
@@ -103,6 +110,7 @@ hands view alegro
 export no-folder --to mjcf --out x
 scenes make mugg
 scenes make mug -n 0
+scenes make mug --stock 1000000000000
 scenes check no-folder
 scenes info no-folder
 learn fit no-folder

@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple, cast, get_args
 
 from pydantic import Field, field_validator
 
-from lgrasp.choices import ProtocolName, VariationName
+from lgrasp.choices import MOST_ROWS, ProtocolName, VariationName
 from lgrasp.config import HandNames, OtherSeed, did_you_mean
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.request import Request
@@ -41,7 +41,7 @@ class CompareRequest(Request):
     objects: tuple[str, ...] = Field(
         ("bottle", "box", "capsule", "mug"), min_length=1, description="Names, paths, folders, or globs."
     )
-    rows: int = Field(200, ge=1, description="Grasps per hand and object.")
+    rows: int = Field(200, ge=1, le=MOST_ROWS, description="Grasps per hand and object.")
     vary: tuple[str, ...] = Field(
         (), description="KIND:VALUES, a variant of each hand per value; kinds: joint_limit, link_scale, finger_spacing."
     )

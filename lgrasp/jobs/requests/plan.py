@@ -6,6 +6,7 @@ from typing import Any, ClassVar, cast
 
 from pydantic import Field, model_validator
 
+from lgrasp.choices import MOST_ROWS
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
 from lgrasp.config import Viewpoint, apply_settings, parse_model
 from lgrasp.engine.request import Request
@@ -29,7 +30,7 @@ class PlanRequest(Request):
         "allegro", description="Name, path, or a shard (its hand); default: the model's hand, else allegro."
     )
     out: Path | None = Field(None, description="Folder of the plans; default: plans/HAND-OBJECT.")
-    starts: int = Field(80, ge=1, description="Points of the surface to start from.")
+    starts: int = Field(80, ge=1, le=MOST_ROWS, description="Points of the surface to start from.")
     object: str | None = Field(None, description="Name, mesh file, or a shard of one object.")
     scale: float = Field(1.0, gt=0, description="Factor from the unit of the mesh or cloud to metres.")
     cloud: Path | None = Field(None, description="Point cloud (.ply .xyz .npy .npz .h5), or a scene.")

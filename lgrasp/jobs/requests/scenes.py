@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from lgrasp.choices import MOST_ROWS
 from lgrasp.config import MeshScale, Seed
 from lgrasp.dataset.files import shards_below
 from lgrasp.engine.folder import check_number
@@ -30,7 +31,7 @@ class SceneRequest(Request):
     scale: MeshScale = 1.0
     grasps: Path | None = Field(None, description="Folder of shards; default: grasps are generated.")
     pipeline: str = Field("robust", description="Generates grasps where no folder of them is given.")
-    stock: int = Field(1000, ge=1, description="Grasps that are generated of each object.")
+    stock: int = Field(1000, ge=1, le=MOST_ROWS, description="Grasps that are generated of each object.")
     scenes: int = Field(100, ge=1)
     seed: Seed = 0
     out: Path = Field(Path("scenes"), description="Folder of the scenes.")

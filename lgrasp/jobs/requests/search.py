@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 
 from pydantic import Field, ValidationInfo, model_validator
 
-from lgrasp.choices import Method, Policy, ProtocolName
+from lgrasp.choices import MOST_BATCH, MOST_ROWS, Method, Policy, ProtocolName
 from lgrasp.cloud.suffixes import CLOUD_SUFFIXES, MASK_SUFFIXES, cloud_names
 from lgrasp.config import HandName, Negatives, OtherSeed, Params, ShardFolder, Viewpoint, parse_model
 from lgrasp.engine.folder import check_number, run_folder
@@ -47,7 +47,7 @@ class SearchRequest(Request):
     rows: int = Field(1000, ge=1, description="Rows requested.")
     pipeline: NamedPipeline
     out: ShardFolder
-    shard_rows: int = Field(10_000, ge=1, description="Rows of a shard; part of what decides the rows.")
+    shard_rows: int = Field(10_000, ge=1, le=MOST_ROWS, description="Rows of a shard; part of what decides the rows.")
 
     @property
     def known_parts(self) -> int:
@@ -80,7 +80,7 @@ class GenerateRequest(SearchRequest):
 
     object: str = Field(description="Name or mesh file.")
     scale: float = Field(1.0, gt=0, description="Factor from the mesh's unit to metres.")
-    batch: int = Field(0, ge=0, description="Candidates per batch; 0: as suits the device.")
+    batch: int = Field(0, ge=0, le=MOST_BATCH, description="Candidates per batch; 0: as suits the device.")
     negatives: Negatives = 0.0
     rate: float = Field(
         1.0,
@@ -143,7 +143,9 @@ class SequenceRequest(SearchRequest):
     simulate: ProtocolName | None = Field(
         None, description="Protocol that the rows of every step must pass to be continued."
     )
-    shard_rows: int = Field(1000, ge=1, description="Sequences of a shard; part of what decides the rows.")
+    shard_rows: int = Field(
+        1000, ge=1, le=MOST_ROWS, description="Sequences of a shard; part of what decides the rows."
+    )
 
     @model_validator(mode="before")
     @classmethod
