@@ -113,7 +113,7 @@ def warm_up(device: Device = "auto", cache_dir: CacheDir = None) -> None:
     import_all()
     modules = kernel_modules()
     with Bar() as bar:
-        if words := first_time(chosen.alias):
+        if words := first_time(chosen.alias, modules):
             bar.say(words)
         load_kernels(chosen.alias, modules, bar.share, preparing=True)
     typer.echo(f"{len(modules)} modules ready on {chosen.alias} ({chosen.name})")

@@ -291,9 +291,10 @@ def prepare(job: Job, todo: "Todo") -> float:
     begin = time.perf_counter()
     if missing and job.kernels:
         job.import_kernels()
-        if words := first_time(todo.device.alias):
+        modules = kernel_modules(*job.kernels)
+        if words := first_time(todo.device.alias, modules):
             job.events.said(words)
-            load_kernels(todo.device.alias, kernel_modules(*job.kernels), job.events.loading, preparing=True)
+            load_kernels(todo.device.alias, modules, job.events.loading, preparing=True)
     kernels = time.perf_counter() - begin
     job.load(job.events, bool(missing))
     begin = time.perf_counter()

@@ -63,9 +63,9 @@ def drop_damaged(folder: Path) -> None:
             _drop(module)
 
 
-def has_compiled(folder: Path, *, cuda: bool) -> bool:
-    """True if the folder holds a module for the processor, or for a GPU."""
-    return any(path.suffix == ".o" if not cuda else path.suffix in (".cubin", ".ptx") for path in folder.glob("*/*"))
+def is_compiled(module: Path, *, cuda: bool) -> bool:
+    """True if the folder of a module holds it for the processor, or for a GPU."""
+    return any(path.suffix in ((".cubin", ".ptx") if cuda else (".o",)) for path in module.glob("*"))
 
 
 def note_checksums(folder: Path) -> None:

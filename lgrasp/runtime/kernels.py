@@ -15,7 +15,7 @@ import warp as wp
 
 import lgrasp
 from lgrasp.runtime.cores import cores
-from lgrasp.runtime.kernel_cache import has_compiled, note_checksums, usable_folder
+from lgrasp.runtime.kernel_cache import is_compiled, note_checksums, usable_folder
 
 
 def import_all() -> None:
@@ -42,11 +42,14 @@ def _kernels(module: ModuleType) -> Iterator[wp.Kernel]:
                 yield x
 
 
-def first_time(device: str) -> str:
-    """What a user is told before this machine compiles its first kernels for a kind of device; "" if it has some."""
-    if has_compiled(Path(wp.config.kernel_cache_dir), cuda=device != "cpu"):
+def first_time(device: str, modules: list[str]) -> str:
+    """What a user is told before most of some modules are compiled for a kind of device; "" if they are there."""
+    folder, cuda = Path(wp.config.kernel_cache_dir), device != "cpu"
+    # the names hold a hash of the code and of the threads of a block: on a CPU one
+    names = [wp.get_module(name).get_module_identifier(None if cuda else 1) for name in modules]
+    if 2 * sum(is_compiled(folder / name, cuda=cuda) for name in names) >= len(names):
         return ""
-    return "compiling kernels once for this machine (30 to 60 s on two cores)"
+    return "compiling kernels once for this machine (up to 60 s on two cores)"
 
 
 PREPARING = [

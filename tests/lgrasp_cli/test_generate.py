@@ -326,7 +326,7 @@ def test_debug_shows_the_traceback_too(cli, monkeypatch):
 
 
 def test_the_first_kernels_of_a_machine_are_announced(generate, monkeypatch, tmp_path):
-    monkeypatch.setattr("lgrasp.runtime.kernels.has_compiled", lambda folder, cuda: False)
+    monkeypatch.setattr("lgrasp.runtime.kernels.is_compiled", lambda module, cuda: False)
     assert "compiling kernels once for this machine" in generate(rows=1).err.splitlines()[0]
     quiet = generate("--quiet", rows=1, out=tmp_path / "quiet")
     assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
