@@ -27,7 +27,7 @@ class Told(Protocol):
     def __call__(self, done: int, note: str, /, *, kept: int) -> None: ...
 
 
-class Descent:
+class GradientStep:
     """One step down a loss: the optimiser, how its rate changes, and the norm to which gradients are cut."""
 
     def __init__(
@@ -98,7 +98,7 @@ class Training:
         self,
         phase: str,
         steps: int,
-        descent: Descent,
+        descent: GradientStep,
         loss: Callable[[int], tuple[torch.Tensor, torch.Tensor]],
         *,
         parts: Mapping[str, Stateful | torch.Generator],

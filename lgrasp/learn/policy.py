@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from lgrasp.learn.curve import LossCurve
-from lgrasp.learn.loop import Descent, Training
+from lgrasp.learn.loop import GradientStep, Training
 from lgrasp.learn.params import PosePolicyParams
 from lgrasp.policy.model import HIT_FEATURES, MOST_HITS, WIDTH, Weights
 from lgrasp.policy.score import (
@@ -104,7 +104,7 @@ def fit_network(
         net = PoseNet(seen.hits.shape[1], seen.distances.shape[1])
         optimiser = torch.optim.AdamW(net.parameters(), lr=params.rate, weight_decay=params.decay)
         rate = torch.optim.lr_scheduler.OneCycleLR(optimiser, params.rate, total_steps=steps + 1)
-        training.run(phase, steps, Descent(optimiser, rate), loss, parts={"net": net}, curve=curve)
+        training.run(phase, steps, GradientStep(optimiser, rate), loss, parts={"net": net}, curve=curve)
     with torch.no_grad():
         net.last.bias.add_(math.log(params.failures))
     return net.eval(), {"loss": curve.points}

@@ -9,7 +9,7 @@ from torch.nn import functional
 from lgrasp.hand.model import HandModel
 from lgrasp.learn.curve import LossCurve
 from lgrasp.learn.examples import Examples
-from lgrasp.learn.loop import Descent, Training
+from lgrasp.learn.loop import GradientStep, Training
 from lgrasp.learn.network import Coarse, CoarseNet, best_answers
 from lgrasp.learn.params import LearnParams
 from lgrasp.refine.refiner import Pose, Refiner
@@ -79,7 +79,7 @@ class Trainer:
             found = self._pose_loss(self._draw(examples), examples)
             return found, found
 
-        return self._run(training, phase, steps, Descent(optimiser, fall), loss, "loss")
+        return self._run(training, phase, steps, GradientStep(optimiser, fall), loss, "loss")
 
     def fit_jointly(self, training: Training) -> LossCurve:
         """``joint_steps`` steps on the energy after K unrolled steps of the refiner, phase ``joint`` of a training; the
@@ -101,7 +101,7 @@ class Trainer:
                 found = found + p.pose_weight * self._pose_loss(batch, examples)
             return found, total.mean()
 
-        descent = Descent(torch.optim.Adam(self.net.parameters(), lr=p.joint_rate), clip=1.0)
+        descent = GradientStep(torch.optim.Adam(self.net.parameters(), lr=p.joint_rate), clip=1.0)
         return self._run(training, "joint", p.joint_steps, descent, loss, "energy")
 
     def _run(
@@ -109,7 +109,7 @@ class Trainer:
         training: Training,
         phase: str,
         steps: int,
-        descent: Descent,
+        descent: GradientStep,
         loss: Callable[[int], tuple[torch.Tensor, torch.Tensor]],
         name: str,
     ) -> LossCurve:

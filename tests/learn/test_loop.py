@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from lgrasp.errors import ConfigError
 from lgrasp.learn import loop
 from lgrasp.learn.curve import LossCurve
-from lgrasp.learn.loop import Descent, Training, falling_rate
+from lgrasp.learn.loop import GradientStep, Training, falling_rate
 
 STEPS = {"first": 7, "second": 12}
 
@@ -39,7 +39,7 @@ def train(training: Training) -> tuple[torch.nn.Module, list[LossCurve]]:
                 found = ((net(x)[:, 0] - x.sum(1)) ** 2).mean()
                 return found, 2 * found
 
-            descent, parts = Descent(optimiser, rate, clip=1.0), {"net": net, "random": draw}
+            descent, parts = GradientStep(optimiser, rate, clip=1.0), {"net": net, "random": draw}
             training.run(phase, steps, descent, loss, parts=parts, every=3, curve=curves[-1])
     return net, curves
 
@@ -86,7 +86,7 @@ def test_what_is_told(monkeypatch):
 
 def test_a_training_that_diverges_says_so():
     weight = torch.nn.Parameter(torch.ones(1))
-    descent = Descent(torch.optim.SGD([weight], lr=1.0))
+    descent = GradientStep(torch.optim.SGD([weight], lr=1.0))
     loss = lambda step: (weight.sum(), weight.sum() * (np.nan if step else 1))  # noqa: E731
     with pytest.raises(ConfigError, match="diverged: its loss is nan at step 2"):
         Training().run("x", 5, descent, loss, parts={}, curve=LossCurve(5))

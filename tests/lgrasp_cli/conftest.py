@@ -11,8 +11,8 @@ from support.places import QUICK
 from lgrasp import notices
 from lgrasp.cloud import model
 from lgrasp.dataset.writer import write_shard
+from lgrasp.runtime import kernels
 from lgrasp.runtime.device import start
-from lgrasp.runtime.kernels import load_kernels
 from lgrasp_cli import progress
 from lgrasp_cli.main import main
 
@@ -42,7 +42,6 @@ def quick():
 def shared_cache(cache_root):
     """The cache of all tests; compiled kernels stay in the user's."""
     start()
-    load_kernels("cpu", ["lgrasp.grasp.duplicates"])  # commands tell when a machine has none
     return cache_root
 
 
@@ -52,6 +51,7 @@ def cli(monkeypatch, capfd, shared_cache, tmp_path):
     monkeypatch.setenv("LGRASP_CACHE_DIR", str(shared_cache))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(progress, "_PLAIN_INTERVAL", float("inf"))  # on a slow machine lines of progress come too
+    monkeypatch.setattr(kernels, "is_compiled", lambda module, cuda: True)  # commands tell where kernels are missing
     monkeypatch.setattr(model, "_MOST_NODES", 30_000)  # distances from clouds are exact enough
     monkeypatch.setattr(notices, "_said", set())  # a command is a process of its own
     monkeypatch.setattr(notices, "_listeners", [])

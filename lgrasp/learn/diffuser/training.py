@@ -12,7 +12,7 @@ from lgrasp.learn.diffuser.examples import StepExamples, split_steps
 from lgrasp.learn.diffuser.network import DiffuserNet, Situation
 from lgrasp.learn.diffuser.params import DiffuserParams
 from lgrasp.learn.diffuser.process import PROCESSES, Process
-from lgrasp.learn.loop import Descent, Training, falling_rate
+from lgrasp.learn.loop import GradientStep, Training, falling_rate
 
 _TOLD = 50  # steps between two looks at the loss: each look waits for the device
 _LOOKS = 40  # at what is learnt, for the curve
@@ -48,7 +48,7 @@ class StepTrainer:
         """
         p, weights = self.params, list(self.net.parameters())
         optimiser = torch.optim.AdamW(weights, lr=p.rate, weight_decay=p.decay, fused=self.device.type == "cuda")
-        descent = Descent(optimiser, falling_rate(optimiser, p.steps, _WARM), clip=1.0)
+        descent = GradientStep(optimiser, falling_rate(optimiser, p.steps, _WARM), clip=1.0)
         curves = {name: LossCurve(p.steps) for name in ("loss", "unseen")}
 
         def loss(_: int) -> tuple[torch.Tensor, torch.Tensor]:

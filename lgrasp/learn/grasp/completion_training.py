@@ -13,7 +13,7 @@ from lgrasp.learn.grasp.completion import SHARES, CompletionNet, Cubes, cubes_of
 from lgrasp.learn.grasp.params import GraspParams
 from lgrasp.learn.grasp.solids import SeenSolid
 from lgrasp.learn.grasp.views import CloudView
-from lgrasp.learn.loop import Descent, Training, falling_rate
+from lgrasp.learn.loop import GradientStep, Training, falling_rate
 from lgrasp.object.sdf import SdfGrid
 
 _TOLD = 20  # steps between two looks at the loss
@@ -87,7 +87,7 @@ def fit_completion(
         found = completion_loss(net(turned), goal, p.nodes)
         return found, found
 
-    descent = Descent(optimiser, falling_rate(optimiser, p.completion_steps, _WARM), clip=1.0)
+    descent = GradientStep(optimiser, falling_rate(optimiser, p.completion_steps, _WARM), clip=1.0)
     parts = {"net": net, "random": draw}
     training.run("completion", p.completion_steps, descent, loss, parts=parts, every=_TOLD, curve=curve)
     convert_conv3d_weight_memory_format(net.eval(), torch.contiguous_format)
