@@ -140,6 +140,7 @@ WRITTEN_BY_HAND = {
     "lgrasp/hand/drafting/write.py": "a folder that is whole or absent",
     "lgrasp/judge/files.py": "a file that is whole or absent; the judge stands alone",
     "lgrasp/judge/run.py": "a temporary folder",
+    "lgrasp/learn/loop.py": "the state of a training in memory",
     "lgrasp/learn/networks.py": "a network in memory",
     "lgrasp/object/load.py": "reads a scene",
     "lgrasp/picture/sheet.py": "a picture in memory",

@@ -98,7 +98,7 @@ class Training:
         self,
         phase: str,
         steps: int,
-        descent: GradientStep,
+        gradient_step: GradientStep,
         loss: Callable[[int], tuple[torch.Tensor, torch.Tensor]],
         *,
         parts: Mapping[str, Stateful | torch.Generator],
@@ -117,15 +117,15 @@ class Training:
             curve: of what is told, means since the last look.
             after: called after each step with the steps done.
         """
-        parts = {"descent": descent, **parts, **({"curve": curve} if curve else {})}
-        devices = [descent.device] if descent.device.type == "cuda" else []
+        parts = {"gradient_step": gradient_step, **parts, **({"curve": curve} if curve else {})}
+        devices = [gradient_step.device] if gradient_step.device.type == "cuda" else []
         with torch.random.fork_rng(devices):
             first = self._take_up(phase, parts, devices)
             begin = time.perf_counter() - self.seconds.setdefault(phase, 0.0)
-            total, counted = torch.zeros((), device=descent.device), 0
+            total, counted = torch.zeros((), device=gradient_step.device), 0
             for done in range(first + 1, steps + 1):
                 lowered, told = loss(done - 1)
-                descent(lowered)
+                gradient_step(lowered)
                 if after:
                     after(done)
                 total, counted = total + told.detach(), counted + 1

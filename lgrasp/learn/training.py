@@ -101,21 +101,21 @@ class Trainer:
                 found = found + p.pose_weight * self._pose_loss(batch, examples)
             return found, total.mean()
 
-        descent = GradientStep(torch.optim.Adam(self.net.parameters(), lr=p.joint_rate), clip=1.0)
-        return self._run(training, "joint", p.joint_steps, descent, loss, "energy")
+        gradient_step = GradientStep(torch.optim.Adam(self.net.parameters(), lr=p.joint_rate), clip=1.0)
+        return self._run(training, "joint", p.joint_steps, gradient_step, loss, "energy")
 
     def _run(
         self,
         training: Training,
         phase: str,
         steps: int,
-        descent: GradientStep,
+        gradient_step: GradientStep,
         loss: Callable[[int], tuple[torch.Tensor, torch.Tensor]],
         name: str,
     ) -> LossCurve:
         curve = LossCurve(steps, turn=len(self._train))
         parts = {"net": self.net, "random": self._random}
-        training.run(phase, steps, descent, loss, parts=parts, name=name, curve=curve)
+        training.run(phase, steps, gradient_step, loss, parts=parts, name=name, curve=curve)
         return curve
 
     def refiner(self, examples: Examples) -> Refiner:

@@ -39,8 +39,8 @@ def train(training: Training) -> tuple[torch.nn.Module, list[LossCurve]]:
                 found = ((net(x)[:, 0] - x.sum(1)) ** 2).mean()
                 return found, 2 * found
 
-            descent, parts = GradientStep(optimiser, rate, clip=1.0), {"net": net, "random": draw}
-            training.run(phase, steps, descent, loss, parts=parts, every=3, curve=curves[-1])
+            gradient_step, parts = GradientStep(optimiser, rate, clip=1.0), {"net": net, "random": draw}
+            training.run(phase, steps, gradient_step, loss, parts=parts, every=3, curve=curves[-1])
     return net, curves
 
 
@@ -86,7 +86,7 @@ def test_what_is_told(monkeypatch):
 
 def test_a_training_that_diverges_says_so():
     weight = torch.nn.Parameter(torch.ones(1))
-    descent = GradientStep(torch.optim.SGD([weight], lr=1.0))
+    gradient_step = GradientStep(torch.optim.SGD([weight], lr=1.0))
     loss = lambda step: (weight.sum(), weight.sum() * (np.nan if step else 1))  # noqa: E731
     with pytest.raises(ConfigError, match="diverged: its loss is nan at step 2"):
-        Training().run("x", 5, descent, loss, parts={}, curve=LossCurve(5))
+        Training().run("x", 5, gradient_step, loss, parts={}, curve=LossCurve(5))

@@ -48,7 +48,7 @@ class StepTrainer:
         """
         p, weights = self.params, list(self.net.parameters())
         optimiser = torch.optim.AdamW(weights, lr=p.rate, weight_decay=p.decay, fused=self.device.type == "cuda")
-        descent = GradientStep(optimiser, falling_rate(optimiser, p.steps, _WARM), clip=1.0)
+        gradient_step = GradientStep(optimiser, falling_rate(optimiser, p.steps, _WARM), clip=1.0)
         curves = {name: LossCurve(p.steps) for name in ("loss", "unseen")}
 
         def loss(_: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -69,7 +69,7 @@ class StepTrainer:
         parts = {"net": self.net, "kept": self.kept, "random": self._random, **curves}
         with torch.random.fork_rng():
             torch.manual_seed(p.seed)  # of dropout
-            training.run(phase, p.steps, descent, loss, parts=parts, every=_TOLD, after=after)
+            training.run(phase, p.steps, gradient_step, loss, parts=parts, every=_TOLD, after=after)
         return {name: curve.points for name, curve in curves.items() if curve.points}
 
     def losses(self) -> tuple[float, float]:

@@ -87,9 +87,9 @@ def fit_completion(
         found = completion_loss(net(turned), goal, p.nodes)
         return found, found
 
-    descent = GradientStep(optimiser, falling_rate(optimiser, p.completion_steps, _WARM), clip=1.0)
+    gradient_step = GradientStep(optimiser, falling_rate(optimiser, p.completion_steps, _WARM), clip=1.0)
     parts = {"net": net, "random": draw}
-    training.run("completion", p.completion_steps, descent, loss, parts=parts, every=_TOLD, curve=curve)
+    training.run("completion", p.completion_steps, gradient_step, loss, parts=parts, every=_TOLD, curve=curve)
     convert_conv3d_weight_memory_format(net.eval(), torch.contiguous_format)
     return curve
 
