@@ -52,9 +52,15 @@ def test_a_lateral_grasp_touches_with_the_side_of_the_index_finger(steered, link
     assert judge(path).valid_share == 1.0
     config = shard.header.config
     sides = [side | {"axis": [0, -1, 0]} for side in config["steered"]["sides"]]
-    with h5py.File(path, "r+") as file:
-        file.attrs["config"] = json.dumps(config | {"steered": config["steered"] | {"sides": sides}})
+    ask_otherwise(path, config, sides=sides)
     assert judge(path).failed["steered"].all()
+
+
+def ask_otherwise(path, config, **changes):
+    """Rewrite what a shard says was asked, as its author."""
+    with h5py.File(path, "r+") as file:
+        file.attrs["config"] = json.dumps(config | {"steered": config["steered"] | changes})
+        file.attrs.pop("text_sha256", None)
 
 
 def thumb_angles(shard, link_poses):
@@ -77,8 +83,7 @@ def test_the_thumb_is_where_it_is_asked_to_be(steered, link_poses, asked):
     config = shard.header.config
     for change in ({"place": "abducted" if adducted else "adducted"}, {"link": "thumb"}):
         thumb = config["steered"]["thumb"] | change
-        with h5py.File(path, "r+") as file:
-            file.attrs["config"] = json.dumps(config | {"steered": config["steered"] | {"thumb": thumb}})
+        ask_otherwise(path, config, thumb=thumb)
         assert judge(path).failed["steered"].all()
 
 
@@ -154,8 +159,7 @@ def test_the_judge_agrees_and_finds_rows_that_do_not_obey(steered):
         ("approach", {"direction": [-1, 0, 0], "angle": 40}),
         ("above", [0, 0, 1, 0.003]),
     ):
-        with h5py.File(path, "r+") as file:
-            file.attrs["config"] = json.dumps(config | {"steered": config["steered"] | {name: value}})
+        ask_otherwise(path, config, **{name: value})
         report = judge(path)
         assert report.failed["steered"].all(), name
         assert not any(mask.any() for check, mask in report.failed.items() if check != "steered"), name
@@ -191,9 +195,7 @@ def obeys_only_its_poses(path):
     poses = np.array(config["steered"]["poses"])
     mine = np.abs(found[:, None] - poses[None]).max(2).argmin(1) == (gone := np.abs(poses - found[0]).max(1).argmin())
     others = np.delete(poses, gone, 0).tolist()
-    config["steered"] = config["steered"] | {"poses": others}
-    with h5py.File(path, "r+") as file:
-        file.attrs["config"] = json.dumps(config)
+    ask_otherwise(path, config, poses=others)
     np.testing.assert_array_equal(judge(path).failed["steered"], mine)
 
 
