@@ -174,14 +174,14 @@ class JobProgress(Events):
 def interruptible(progress: JobProgress) -> Iterator[JobProgress]:
     """The first Ctrl-C (or SIGTERM, SIGHUP) ends the job as soon as it can, the second, or five seconds, at once.
 
-    Whole files stay, what is being made is dropped.
+    Whole files stay, and what the job keeps of the next.
     """
 
     def stop(again: bool) -> None:
         if again or not progress.running:
             stop_now()
         progress.stop = True
-        tell("stopping; what is being made is dropped; press Ctrl-C again to stop at once")
+        tell("stopping; press Ctrl-C again to stop at once")
 
     with on_interrupt(stop):
         yield progress
