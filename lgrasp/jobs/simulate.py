@@ -96,8 +96,10 @@ class SimulateJob(SimulateRequest, VerdictJob):
         workers = threads(self.workers)
         with ShardReader(part.source) as reader:
             hand, objects, rows = reader.hand(), reader.objects(), len(reader)
-            ahead = partial(load_world_kernels, hand, objects, reader.rows(0, min(rows, 1)), protocol, device)
-            scene = self._scene_of(hand, objects, progress, None if self._kind() == "cpu" else ahead)
+            ahead = None
+            if self._kind() == "gpu":
+                ahead = partial(load_world_kernels, hand, objects, reader.rows(0, 1), protocol, device)
+            scene = self._scene_of(hand, objects, progress, ahead)
             key = self.key_of(reader)
             kept = KeptVerdicts(self.cache, key, name, largest=_GPU_BLOCK if self._kind() == "gpu" else None)
 
