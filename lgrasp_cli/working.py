@@ -261,8 +261,9 @@ def conclude(outcome: "JobOutcome", how: How) -> None:
 def _left(outcome: "JobOutcome", how: How) -> str:
     """What an interrupted job leaves, and what the same command makes of it."""
     job, done, kept = outcome.job, len(outcome.paths), outcome.job.kept_rows(outcome)
-    what = f"{'verdicts of ' if job.command == 'simulate' else ''}{kept:,} {job.unit}{' of the next' if done else ''}"
-    rows = f"{what} are kept" if kept else ""
+    verdicts = "verdicts of " if job.command == "simulate" else ""
+    what = f"{verdicts}{plural(kept, job.unit[:-1])}{' of the next' if done else ''}"
+    rows = f"{what} {'is' if kept == 1 and not verdicts else 'are'} kept" if kept else ""
     files = f"{done:,} of {plural(len(outcome.parts), 'file')} done in {job.folder}" if done else ""
     if not (done or kept):
         return "nothing is finished; the same command begins again"

@@ -32,7 +32,7 @@ class ShardResult:
     candidates: int = 0
     duplicates: int = 0
     exhausted: bool = False  # the effort bound was reached before the rows were
-    resumed: int = 0  # rows that an earlier run found
+    resumed: int = 0  # rows that an earlier run gave, or found until it was interrupted
     tally: Counter[str] = field(default_factory=Counter)  # what the job counts among its rows
 
     @property

@@ -41,6 +41,8 @@ class Made:
     """What is to be written; forgotten when it is on disk. None: there is nothing to write."""
     result: Any = None
     """What the report needs of it; kept until the job ends."""
+    kept: int = 0
+    """Rows of it that an earlier run made."""
 
 
 @dataclass
@@ -81,12 +83,12 @@ class JobOutcome:
     @property
     def made(self) -> int:
         """Rows made by this call."""
-        return sum(made.rows for _, made in self.made_parts)
+        return sum(made.rows - made.kept for _, made in self.made_parts)
 
     @property
     def present(self) -> int:
-        """Rows that were there already."""
-        return sum(self.on_disk.values())
+        """Rows that an earlier run made."""
+        return sum(self.on_disk.values()) + sum(made.kept for _, made in self.made_parts)
 
     @property
     def rows(self) -> int:

@@ -307,7 +307,7 @@ class _Rows:
         self._parts.append((table, own))
         self.result = replace(account.found, grasps=no_grasps())
         self.add(take_rows(table, slice(account.kept, None)))
-        self.result.resumed = self.count
+        self.result.resumed = account.kept
 
     def account(self, *, interrupted: bool = False) -> Account:
         """How far the shard has come."""

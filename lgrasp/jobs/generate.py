@@ -171,7 +171,8 @@ class GenerateJob(GenerateRequest, SearchJob):
         contents = self.shard(part, result, rows, told)
         result.tally = count_made(rows, contents.header.config, self._moving)
         # a copy: memory must not grow with the shards
-        return Made(len(result.grasps), contents, replace(result, grasps=take_grasps(result.grasps, np.zeros(0, int))))
+        forgotten = replace(result, grasps=take_grasps(result.grasps, np.zeros(0, int)))
+        return Made(len(result.grasps), contents, forgotten, result.resumed)
 
     @property
     def _moving(self) -> np.ndarray:

@@ -9,6 +9,7 @@ from lgrasp.engine.run import Job, look
 from lgrasp.files import temporary_folder
 from lgrasp.jobs.generate import GenerateJob
 from lgrasp.runtime.array import Array
+from lgrasp.words import plural
 
 
 class PlanLine(NamedTuple):
@@ -40,7 +41,7 @@ def preview(job: Job, *, array: Array | tuple[int, int], resume: bool) -> list[P
         if job.late_key and resume and part.file.exists():
             lines.append(PlanLine("shard", number, "present", "nothing, if it is of the same grasps", file))
             continue
-        what = f"{part.rows:,} {job.unit}" + (", replacing the file" if part.file.exists() else "")
+        what = plural(part.rows, job.unit[:-1]) + (", replacing the file" if part.file.exists() else "")
         lines.append(PlanLine("shard", number, "missing", what, file))
     return lines
 

@@ -134,7 +134,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
                 f"seconds_{name}_compile": kept.compiling,
             },
         }
-        return Made(rows, (kept, key, added), (kept.seconds, kept.compiling))
+        return Made(rows, (kept, key, added), (kept.seconds, kept.compiling), before)
 
     def close(self) -> None:
         self._kept.close()

@@ -90,8 +90,10 @@ class Training:
     ) -> None:
         self.seconds: dict[str, float] = {}
         """That each phase took, in all runs [s]."""
+        self.resumed = 0
+        """Steps that an earlier run did."""
         self._told, self._keep, self._phases = told, keep, dict(kept or {})
-        self._before = self._resumed = 0  # steps of the phases before, and those that an earlier run did
+        self._before = 0  # steps of the phases before
         self._last = time.monotonic()
 
     def run(
@@ -151,7 +153,7 @@ class Training:
             keep()
         try:
             if self._told:
-                self._told(self._before + done, words, kept=self._resumed)
+                self._told(self._before + done, words, kept=self.resumed)
         except BaseException:
             if self._keep:
                 keep()
@@ -171,7 +173,7 @@ class Training:
         for device, random in zip(devices, state["random"][1:], strict=True):
             torch.cuda.set_rng_state(random, device)
         self.seconds[phase] = state["seconds"]
-        self._resumed += state["done"]
+        self.resumed += state["done"]
         return state["done"]
 
 

@@ -96,15 +96,18 @@ def test_interrupted_trainings_go_on(generate, cli, monkeypatch, kept):
     assert generate(rows=20).code == 0
     asked = ["--steps", 10, "--joint-steps", 3, "--unrolled", 1, "--batch", 8, "--device", "cpu"]
     assert cli("learn", "fit", "out", "--out", "whole.pt", *asked).code == 0
-    for steps in (4, 15):
+    for steps, words in ((1, "1 step is"), (15, "15 steps are")):
         with monkeypatch.context() as patch:
             interrupted_at(steps, patch)
             done = cli("learn", "fit", "out", "--out", "net.pt", *asked)
         assert done.code == 130
-        assert done.err == f"interrupted: {steps} steps are kept; the same command makes the rest\n"
+        assert done.err == f"interrupted: {words} kept; the same command makes the rest\n"
         assert not Path("net.pt").exists()
     assert [path.exists() for path in kept] == [True]
-    assert cli("learn", "fit", "out", "--out", "net.pt", *asked).code == 0
+    done = cli("learn", "fit", "out", "--out", "net.pt", *asked, "--json", "fit.json")
+    assert done.code == 0
+    told = json.loads(Path("fit.json").read_text())
+    assert (told["made"], told["present"]) == (1, 15)  # steps of this run, and of those before
     assert weights("net.pt") == weights("whole.pt")
     shown = [json.loads(cli("learn", "show", path, "--json", "-").out)["report"] for path in ("net.pt", "whole.pt")]
     assert shown[0]["curves"] == shown[1]["curves"]

@@ -176,9 +176,11 @@ def test_verdicts_so_far_are_kept(cli, grasps, tmp_path, monkeypatch, shared_cac
     monkeypatch.setattr(JobProgress, "advanced", lambda self, part, done, note, ahead, kept: told.append((done, kept)))
     result = cli("simulate", path, "--workers", 1, "--json", "-")
     assert result.code == 0, result
+    data = json.loads(result.out)
+    assert (data["made"], data["present"]) == (2, 3)
     assert list(dict.fromkeys(told)) == [(4, 3), (5, 3)]  # those of the run before are no work of this one
     assert blocks == [[0, 1], [2], [3], [3], [4]]
-    (entry,) = json.loads(result.out)["results"]
+    (entry,) = data["results"]
     assert (entry["rows"], entry["held"]) == (5, 2)
     found, whole = (read_shard(file).grasps.columns() for file in (path, tmp_path / "whole" / path.name))
     for name in whole:

@@ -44,7 +44,7 @@ class DiffuserJob(DiffuserRequest, NetworkJob):
         seconds = {"reading": read, "training": training.seconds["drawing"]}
         report = training_report(hand.name, trainer, found.object_names, unseen, seconds, {"drawing": curve})
         about = AboutDiffuser(hand.name, hand.sha256, found.space_names, p, self.key(), report)
-        return Made(part.rows, diffuser_bytes(trainer.kept, about))
+        return Made(part.rows, diffuser_bytes(trainer.kept, about), kept=training.resumed)
 
 
 def evaluate(

@@ -87,7 +87,7 @@ class GraspJob(GraspRequest, NetworkJob):
         report = training_report(hand.name, trainer, [r.name for r in records], unseen, seconds, curves)
         report |= {"completion_loss": float(error)}
         made = Networks(trainer.kept, completes, p, hand.name, hand.sha256, self.key(), report)
-        return Made(part.rows, predictor_bytes(made))
+        return Made(part.rows, predictor_bytes(made), kept=training.resumed)
 
     def made_before(self) -> list[str]:
         return list(self._parts())

@@ -76,7 +76,7 @@ class FitJob(NetworkJob):
         card |= {"hand": hand.name, "hand_sha256": hand.sha256, "params": report["params"], "run_key": self.key()}
         weights = {name: values.cpu() for name, values in trainer.net.state_dict().items()}
         check_trained(weights)
-        return Made(part.rows, network_bytes(card | {"report": report}, weights))
+        return Made(part.rows, network_bytes(card | {"report": report}, weights), kept=training.resumed)
 
 
 def load_predictor(path: Path) -> tuple[CoarseNet, dict[str, Any]]:

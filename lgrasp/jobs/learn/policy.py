@@ -103,7 +103,7 @@ class PolicyJob(PolicyRequest, FileJob):
     def make(self, part: Part, progress: PartProgress) -> Made:
         p, hand = self.params, self.loaded[0].model
         points = reach_points(self.loaded[1].model, p.seed)
-        start = time.perf_counter()
+        start, kept = time.perf_counter(), self.kept_of(part)
         examples: list[PoseExamples] = []
         with ThreadPoolExecutor(self.threads()) as pool:
             learned = self.learned
@@ -146,7 +146,7 @@ class PolicyJob(PolicyRequest, FileJob):
         about = {"run_key": self.key(), "report": {k: v for k, v in report.items() if k != "seconds"}}
         networks = by_reach.weights(), by_contacts.weights()
         made = PosePolicy(hand.name, hand.tree.joint_names, hand.groups, points, *networks, sources, proposals, about)
-        return Made(part.rows, policy_bytes(made), report)
+        return Made(part.rows, policy_bytes(made), report, kept)
 
     def _sources(self, learned: Pipeline, pool: ThreadPoolExecutor, progress: PartProgress) -> dict[str, float]:
         """Factors of the weights of several sources of poses: the root of the share of candidates that give grasps by
