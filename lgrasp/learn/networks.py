@@ -85,9 +85,6 @@ def open_network(path: Path, kind: str, version: int) -> "Iterator[tuple[dict[st
     with _as_told(path, kind):
         import torch
 
-        with zipfile.ZipFile(path) as archive:
-            if (size := sum(info.file_size for info in archive.infolist())) > _MOST_BYTES:
-                raise ValueError(f"{size:,} bytes")
         card = _card(path)
         if card["kind"] != kind or card["version"] != version:
             raise ValueError(f"kind '{card['kind']}', version {card['version']}")
@@ -155,8 +152,12 @@ def check_network_hand(path: Path, hand: str, sha256: str, asked: str, digest: s
 
 def _card(path: Path) -> dict[str, Any]:
     with zipfile.ZipFile(path) as archive:
+        if (size := sum(info.file_size for info in archive.infolist())) > _MOST_BYTES:
+            raise ValueError(f"{size:,} bytes")
         if (size := archive.getinfo(_CARD).file_size) > _MOST_CARD:
             raise ValueError(f"a card of {size:,} bytes")
+        if damaged := archive.testzip():  # torch does not look
+            raise ValueError(f"{damaged} is damaged")
         card = json.loads(archive.read(_CARD))
     for name, kind in {"kind": str, "version": int, "hand": str, "hand_sha256": str, "report": dict}.items():
         if not isinstance(card[name], kind):
