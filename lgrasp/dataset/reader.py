@@ -108,7 +108,8 @@ class FileReader:
                 sha256=attrs["hand_sha256"],
                 meshes={blob.attrs["path"]: blob[()].tobytes() for blob in blobs},
             )
-        self._require(check and (changed_texts(self._file, nodes) or hand_problems(record)))
+            changed = changed_texts(self._file, nodes) if check else []
+        self._require(check and (changed or hand_problems(record)))
         return record
 
     def object(self, object_id: str, *, check: bool = True) -> ObjectRecord:

@@ -1,8 +1,10 @@
 import random
+import re
 import resource
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -68,6 +70,21 @@ def test_bit_flips_anywhere_are_noticed_or_harmless(tmp_path, whole, same_rows):
             same_rows(expected.grasps, shard.grasps)
             assert (shard.header, shard.statistics) == (expected.header, expected.statistics)
             assert (shard.hand.urdf, shard.hand.meshes) == (expected.hand.urdf, expected.hand.meshes)
+
+
+@pytest.mark.parametrize("block", [b"BTLF", b"FHDB"])
+def test_damaged_attributes_are_told(tmp_path, make_shard, block):
+    """Where HDF5 keeps the attributes of something with many."""
+    path = tmp_path / "s.h5"
+    write_shard(path, replace(make_shard(4), statistics={f"number_{k}": k for k in range(40)}))
+    whole = path.read_bytes()
+    at = [found.start() for found in re.finditer(block, whole)]
+    assert at
+    for place in (start + offset for start in at for offset in (5, 20, 100)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        assert validate_shard(path)
+        with pytest.raises(ShardError, match=r"s\.h5: "):
+            read_shard(path)
 
 
 def test_damaged_string_heap_does_not_hang(tmp_path, whole):
