@@ -266,6 +266,10 @@ def _left(outcome: "JobOutcome", how: How) -> str:
     rows = f"{what} {'is' if kept == 1 and not verdicts else 'are'} kept" if kept else ""
     files = f"{done:,} of {plural(len(outcome.parts), 'file')} done in {job.folder}" if done else ""
     if not (done or kept):
+        if not how.cache.fresh and any(map(job.has_prepared, outcome.parts)):
+            return "what was prepared is kept; the same command goes on"
         return "nothing is finished; the same command begins again"
-    again = "the same command without --overwrite" if how.overwrite and done else "the same command"
+    dropped = {"--overwrite": how.overwrite and done, "--rebuild": how.cache.fresh and kept}
+    without = " and ".join(name for name, drops in dropped.items() if drops)
+    again = f"the same command{without and f' without {without}'}"
     return "; ".join(filter(None, (files, rows, f"{again} makes the rest")))

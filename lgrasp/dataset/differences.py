@@ -107,20 +107,25 @@ def check_files(paths: Paths, check: Callable[[Path], list[str]], *, below: bool
     return problems
 
 
-def _listed_folders(paths: Paths, *, deep: bool = True) -> list[Path]:
+def _listed_folders(paths: Paths, *, deep: bool = True, leave_out: Path | None = None) -> list[Path]:
     """The folders among some paths, and those below them, of any depth if ``deep``, that hold shards or list some."""
     below = folders_below(paths, deep=deep)
     for top in given_paths(paths) if deep else ():
         for folder, names in walk(top, unread=lambda _: None) if top.is_dir() else ():
             if MANIFEST in names and folder not in below:
                 with suppress(ShardError):  # of something else
-                    below += [folder] if read_manifest(folder / MANIFEST) else []
-    return below
+                    listed = read_manifest(folder / MANIFEST)
+                    below += [folder] if listed and any(run.unit != "scenes" for run in listed.runs) else []
+    return [folder for folder in below if not (leave_out and folder.resolve().is_relative_to(leave_out.resolve()))]
 
 
-def tell_differences(paths: Paths) -> None:
-    """Report what is missing from folders, or not listed, by their manifests; the files are not read."""
-    for folder in _listed_folders(paths):
+def tell_differences(paths: Paths, leave_out: Path | None = None) -> None:
+    """Report what is missing from folders, or not listed, by their manifests; the files are not read.
+
+    Args:
+        leave_out: Folder that is not looked into.
+    """
+    for folder in _listed_folders(paths, leave_out=leave_out):
         try:
             if found := compare_folder(folder, verify=False):
                 notice(found.missing_line(folder / MANIFEST))

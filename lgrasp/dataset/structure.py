@@ -78,6 +78,7 @@ def _walk(file: h5py.File) -> tuple[dict[str, Any], str]:
     nodes: dict[str, Any] = {"": file}
     readonly = file.mode == "r"
     todo: list[tuple[str, h5py.Group, int]] = [("", file, 1)]
+    known = {h5py.h5o.get_info(file.id).addr}
     while todo:
         path, group, depth = todo.pop()
         for name, link in _links(group):
@@ -90,6 +91,9 @@ def _walk(file: h5py.File) -> tuple[dict[str, Any], str]:
             if isinstance(node, h5py.Group):
                 if depth == _MOST_GROUPS:
                     return nodes, f"{here}: more than {_MOST_GROUPS} groups inside each other"
+                if (address := h5py.h5o.get_info(node.id).addr) in known:
+                    return nodes, f"{here}: is a link to another group; the file must hold each once"
+                known.add(address)
                 todo.append((f"{here}/", node, depth + 1))
             elif isinstance(node, h5py.Dataset) and (problem := _foreign_data(node)):
                 return nodes, f"{here}: {problem}"

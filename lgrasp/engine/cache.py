@@ -62,7 +62,7 @@ class Cache:
         fresh: bool = False,
     ) -> None:
         self.root = cache_dir(root)
-        self._fresh = fresh
+        self.fresh = fresh
         self._stored: set[Path] = set()
         self.kept = Keeper()
         """What jobs of this process share in memory."""
@@ -80,7 +80,7 @@ class Cache:
     def has(self, kind: str, key: str) -> bool:
         """True if there is an entry. (It may still prove damaged on loading.)"""
         path = self.path(kind, key)
-        return os.path.isfile(path) and (not self._fresh or path in self._stored)
+        return os.path.isfile(path) and (not self.fresh or path in self._stored)
 
     def load(self, kind: str, key: str) -> "dict[str, np.ndarray] | None":
         """Arrays of an artifact, or None if it is absent or damaged (which is reported)."""

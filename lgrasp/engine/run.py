@@ -204,6 +204,10 @@ class Job(Request, ABC):
         """The same of one part."""
         return 0
 
+    def has_prepared(self, part: Part) -> bool:
+        """Whether something else is kept of what is made before the rows of a part."""
+        return False
+
     def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
         """The error for an outcome that falls short of the request, if any."""
         return None

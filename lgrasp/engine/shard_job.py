@@ -46,7 +46,7 @@ class ShardJob(ShardRequest, Job):
             return len(reader), reader.header.shard_index
 
         if not self.in_place:
-            tell_differences(self.shards)
+            tell_differences(self.shards, self.inside)
         out, parts, places = self.folder, [], {}
         for number, (source, place, (rows, index)) in enumerate(gather(self.shards, look, leave_out=self.inside)):
             parts.append(Part(number, source if self.in_place else out / place, rows, source, index))

@@ -17,7 +17,7 @@ from lgrasp.dataset.reader import ShardReader, count_rows
 from lgrasp.engine.cache import Cache
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.shard_job import rows_digest
-from lgrasp.errors import LgraspError, PhysicsError, ShardError
+from lgrasp.errors import PhysicsError, ShardError
 from lgrasp.grasp.records import HandRecord, ObjectRecord
 from lgrasp.jobs.records import cutter
 from lgrasp.jobs.requests.shards import SimulateRequest
@@ -207,7 +207,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
             try:
                 scene = scene_of(hand, objects, cutter(self.cache, self.events, progress, cutting))
                 for future in begun:
-                    with suppress(LgraspError):  # who needs it meets it again
+                    with suppress(Exception):  # a head start; who needs it meets it again
                         future.result()
             finally:
                 pool.shutdown(wait=False)  # who stops the job does not wait

@@ -25,19 +25,24 @@ def find_shards(given: Sequence[str | Path]) -> list[Path]:
         found += files
     once: dict[Path, Path] = {}
     for path in found:
-        once.setdefault(path.resolve(), path)
+        once.setdefault(real(path), path)
     return list(once.values())
+
+
+def real(path: str | Path) -> Path:
+    """Where a path leads; links in a circle lead to themselves."""
+    return Path(os.path.realpath(path))
 
 
 def _inside(top: Path) -> list[Path]:
     """Shards in a folder and those below it, sorted; each folder once. macOS puts a ``._NAME`` beside some files."""
     found: list[Path] = []
-    seen: set[str] = set()
+    seen: set[Path] = set()
     for folder, below, names in os.walk(top, onerror=_refuse, followlinks=True):
-        if (real := os.path.realpath(folder)) in seen:
+        if (here := real(folder)) in seen:
             below.clear()
             continue
-        seen.add(real)
+        seen.add(here)
         below.sort()
         found += [Path(folder, name) for name in names if name.endswith(".h5") and not name.startswith("._")]
     return sorted(found)
@@ -72,7 +77,7 @@ def check_report(path: str) -> None:
         return
     if not _may_be_replaced(path):
         raise JudgeError(f"file {path} is there and holds no findings; it stays: name another")
-    nearest = next(folder for folder in Path(os.path.realpath(path)).parents if folder.exists())
+    nearest = next(folder for folder in real(path).parents if folder.exists())
     try:
         tempfile.TemporaryFile(dir=nearest).close()
     except OSError as error:
@@ -96,7 +101,7 @@ def write_report(path: str, text: str) -> None:
     Raises:
         JudgeError: it cannot be written.
     """
-    target = Path(os.path.realpath(path))
+    target = real(path)
     made = target.with_name(f"{uuid.uuid4().hex}.tmp")
     try:
         if _is_special(path):

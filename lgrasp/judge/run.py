@@ -15,7 +15,7 @@ import numpy as np
 from lgrasp.judge.bounds import JudgeError
 from lgrasp.judge.checks import CHECKS, VALUES, RowChecks
 from lgrasp.judge.duplicates import count_repeats
-from lgrasp.judge.files import existing, find_shards
+from lgrasp.judge.files import existing, find_shards, real
 from lgrasp.judge.report import Report, ShardVerdict
 from lgrasp.judge.shard import JudgedShard, not_judged, read_shard
 
@@ -51,7 +51,7 @@ def judge(
             shards.save(path := Path(folder) / "grasps.h5")
             return judge(path, urdf=urdf, mesh=mesh, rows=rows, progress=progress)
     given = [shards] if isinstance(shards, str | Path) else list(shards)
-    paths, named, left_out = find_shards(given), {Path(path).resolve() for path in given}, list[str]()
+    paths, named, left_out = find_shards(given), {real(path) for path in given}, list[str]()
     if rows is not None and rows < 1:
         raise JudgeError(f"rows {rows}: at least 1")
     meshes = {} if mesh is None else mesh if isinstance(mesh, Mapping) else {"": mesh}
@@ -64,7 +64,7 @@ def judge(
         try:
             return [make()]
         except JudgeError as error:
-            if path.resolve() in named:
+            if real(path) in named:
                 raise
             left_out.append(str(error))
             return []
@@ -78,7 +78,7 @@ def judge(
     counts = [len(s.kept_invalid) for s in read]
     total = sum(counts)
     if not total:
-        raise JudgeError(f"no row in {', '.join(map(str, paths[:3]))}")
+        raise JudgeError("; ".join([f"no row in {', '.join(str(s.path) for s in read[:3])}", *left_out[:1]]))
     chosen = np.arange(total)
     if rows is not None and rows < total:
         chosen = np.sort(np.random.default_rng(0).choice(total, rows, replace=False))

@@ -104,7 +104,7 @@ def check_members(file: h5py.File) -> None:
     """
     found: dict[str, h5py.Group | h5py.Dataset] = {"": file}
     texts: dict[str, Any] = {}
-    todo = [""]
+    todo, known = [""], {_address(file)}
     while todo:
         path = todo.pop()
         for name in (group := found[path]):
@@ -115,6 +115,9 @@ def check_members(file: h5py.File) -> None:
             if isinstance(member, h5py.Group):
                 if here.count("/") >= MOST_GROUPS:
                     raise JudgeError(f"{here!r}: more than {MOST_GROUPS} groups inside each other")
+                if (address := _address(member)) in known:
+                    raise JudgeError(f"{here!r} is a link to another group; a shard holds each once")
+                known.add(address)
                 todo.append(here)
             elif isinstance(member, h5py.Dataset) and member.shape == () and h5py.check_string_dtype(member.dtype):
                 texts[here] = _text(_array(group, name))
@@ -126,6 +129,10 @@ def check_members(file: h5py.File) -> None:
     document = json.dumps(texts, sort_keys=True, separators=(",", ":"), default=str)
     if told != hashlib.sha256(document.encode()).hexdigest():
         raise JudgeError("attributes or texts were changed after writing: text_sha256 differs")
+
+
+def _address(group: h5py.Group) -> int:
+    return h5py.h5o.get_info(group.id).addr
 
 
 def _array(group: h5py.Group, name: str) -> np.ndarray:

@@ -73,13 +73,35 @@ def falling_rate(optimiser: torch.optim.Optimizer, steps: int, rising: int) -> t
     return torch.optim.lr_scheduler.LambdaLR(optimiser, share)
 
 
+class _Mean:
+    """The mean of numbers on a device since it was last taken, which alone waits for the device."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._sum, self._count = torch.zeros((), device=device), 0
+
+    def add(self, value: torch.Tensor) -> None:
+        self._sum, self._count = self._sum + value.detach(), self._count + 1
+
+    def take(self) -> float:
+        mean = float(self._sum) / self._count
+        self._sum, self._count = torch.zeros_like(self._sum), 0
+        return mean
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"sum": self._sum, "count": self._count}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._sum, self._count = state["sum"].to(self._sum.device), state["count"]
+
+
 class Training:
     """The phases of one training, one after another.
 
     Args:
-        told: what it raises ends the training, once the state is kept.
+        told: called at each look at what is lowered; what it raises ends the training, once the state is kept.
         kept: what an earlier run of the same training kept of its phases.
         keep: called now and then with the phases so far, and how many steps were done in them.
+        check: called after the other steps; as ``told`` it may raise.
     """
 
     def __init__(
@@ -87,12 +109,13 @@ class Training:
         told: Told | None = None,
         kept: Mapping[str, bytes] | None = None,
         keep: Callable[[dict[str, bytes], int], None] | None = None,
+        check: Callable[[], None] | None = None,
     ) -> None:
         self.seconds: dict[str, float] = {}
         """That each phase took, in all runs [s]."""
         self.resumed = 0
         """Steps that an earlier run did."""
-        self._told, self._keep, self._phases = told, keep, dict(kept or {})
+        self._told, self._keep, self._check, self._phases = told, keep, check, dict(kept or {})
         self._before = 0  # steps of the phases before
         self._last = time.monotonic()
 
@@ -119,41 +142,46 @@ class Training:
             curve: of what is told, means since the last look.
             after: called after each step with the steps done.
         """
-        parts = {"gradient_step": gradient_step, **parts, **({"curve": curve} if curve else {})}
+        mean = _Mean(gradient_step.device)
+        parts = {"gradient_step": gradient_step, "mean": mean, **parts, **({"curve": curve} if curve else {})}
         devices = [gradient_step.device] if gradient_step.device.type == "cuda" else []
         with torch.random.fork_rng(devices):
             first = self._take_up(phase, parts, devices)
             begin = time.perf_counter() - self.seconds.setdefault(phase, 0.0)
-            total, counted = torch.zeros((), device=gradient_step.device), 0
             for done in range(first + 1, steps + 1):
                 lowered, told = loss(done - 1)
                 gradient_step(lowered)
                 if after:
                     after(done)
-                total, counted = total + told.detach(), counted + 1
+                mean.add(told)
+                words = ""
                 if done % every == 0 or done == steps:
-                    value = float(total) / counted
-                    total, counted = torch.zeros_like(total), 0
+                    value = mean.take()
                     if curve:
                         curve(done, value)
-                    self.seconds[phase] = time.perf_counter() - begin
-                    self._tell(phase, done, steps, f"{name} {value:.3f}", parts, devices)
+                    words = f"{name} {value:.3f}"
+                self.seconds[phase] = time.perf_counter() - begin
+                self._after(phase, done, done == steps, words, parts, devices)
         self._before += steps
 
-    def _tell(
-        self, phase: str, done: int, steps: int, words: str, parts: Mapping[str, Any], devices: list[torch.device]
+    def _after(
+        self, phase: str, done: int, whole: bool, words: str, parts: Mapping[str, Any], devices: list[torch.device]
     ) -> None:
+        """Tell the words, if there are any, and keep the state if it is time."""
+
         def keep() -> None:
             self._phases[phase] = _packed(done, self.seconds[phase], parts, devices)
             assert self._keep
             self._keep(self._phases, self._before + done)
             self._last = time.monotonic()
 
-        if self._keep and (done == steps or time.monotonic() - self._last > _KEEP):
+        if self._keep and (whole or time.monotonic() - self._last > _KEEP):
             keep()
         try:
-            if self._told:
+            if words and self._told:
                 self._told(self._before + done, words, kept=self.resumed)
+            elif self._check and not words:
+                self._check()
         except BaseException:
             if self._keep:
                 keep()

@@ -6,6 +6,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
+from inspect import signature
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -116,15 +118,20 @@ def load_launched(call: Callable[[], object], device: str) -> None:
 
         return note
 
-    def both(condition: object, on_true: Any = None, on_false: Any = None, **options: Any) -> None:
-        for each in (on_true, on_false, options.pop("while_body", None)):
-            if callable(each):
-                each(**options)
+    def every_way(real: Callable[..., Any], *args: Any, **options: Any) -> Any:
+        if threading.get_ident() != caller:
+            return real(*args, **options)
+        told = signature(real).bind(*args, **options).arguments
+        for name in ("on_true", "on_false", "while_body"):
+            if callable(body := told.get(name)):
+                body(**told.get("kwargs", {}))
+        return None
 
     with _noting:
         noted: dict[str, Any] = {name: instead(getattr(wp, name)) for name in ("launch", "launch_tiled")}
         noted["get_suggested_block_size"] = instead(wp.get_suggested_block_size, (256, 1))
-        with mock.patch.multiple(wp, **noted, capture_while=both, capture_if=both):
+        noted |= {name: partial(every_way, getattr(wp, name)) for name in ("capture_while", "capture_if")}
+        with mock.patch.multiple(wp, **noted):
             call()
 
     def load(module: wp.Module) -> None:

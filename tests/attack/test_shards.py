@@ -70,6 +70,16 @@ def ring(file: h5py.File, folder: Path) -> None:
     file["hand/again"] = file["hand"]
 
 
+def many_ways(file: h5py.File, folder: Path) -> None:
+    """Each group twenty times in the one above: 64 million paths."""
+    above = file
+    for depth in range(7):
+        below = file.create_group(f"deep{depth}")
+        for k in range(20):
+            above[f"way{k}"] = below
+        above = below
+
+
 def declared(file: h5py.File, folder: Path) -> None:
     group, name, values = replaced(file, "grasps/q")
     group.create_dataset(name, (10**12, values.shape[1]), values.dtype, chunks=(1024, values.shape[1]))
@@ -113,6 +123,7 @@ TAMPERED = (
     virtual,
     nested,
     ring,
+    many_ways,
     declared,
     control_letters,
     markup,

@@ -10,7 +10,7 @@ from support.jobs import SampleJob, StopAfter
 from support.shards import sample_shard
 from typer.testing import CliRunner
 
-from lgrasp.dataset.manifest import ListedRun, Manifest
+from lgrasp.dataset.manifest import ListedRun, ListedShard, Manifest
 from lgrasp.dataset.status import folder_states
 from lgrasp.dataset.torch_dataset import GraspDataset
 from lgrasp.dataset.writer import write_shard
@@ -134,6 +134,24 @@ def test_a_folder_below_that_lost_all_its_shards(tmp_path, said):
     assert (result.exit_code, result.stderr) == (2, f"{lost}\n")
     assert len(GraspDataset(tmp_path)) == 6
     assert said == [lost]
+
+
+def test_what_a_folder_lost_of_scenes_or_is_being_made_in_it_is_not_told(tmp_path, said):
+    """Copies that go into the folder of their sources are what the command makes."""
+    run(SampleJob(out=tmp_path / "a"))
+    copies = ("dataset", "metrics", tmp_path, "--add", "volume", "--out", tmp_path / "more")
+    for _ in range(2):
+        assert call(*copies).exit_code == 0
+        for path in (tmp_path / "more").rglob("*.h5"):
+            path.unlink()
+    assert said == []
+    shutil.rmtree(tmp_path / "more")
+    lost = [ListedShard(shard_index=0, file="toy-scene-00000.h5", rows=1)]
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "manifest.json").write_text(
+        Manifest(runs=[ListedRun(run_key="a", unit="scenes", shards=lost)]).model_dump_json()
+    )
+    assert call("dataset", "check", tmp_path).stdout == "3 shards valid\n"
 
 
 def test_a_run_without_shards_is_nothing(tmp_path):

@@ -169,7 +169,7 @@ MENDS = {
     "not in the shard": lambda f: f.__delitem__("hand/meshes"),
     "base link": lambda f: f["hand"].attrs.__setitem__("base_link", "arm"),
     "groups inside each other": lambda f: f.create_group("g" + "/g" * 60),
-    "'hand/again/again.*groups": lambda f: f.__setitem__("hand/again", f["hand"]),
+    "'hand/again' is a link to another group": lambda f: f.__setitem__("hand/again", f["hand"]),
     "text_sha256 differs": lambda f: f.attrs.__setitem__("text_sha256", "0" * 64),
 }
 
@@ -242,6 +242,7 @@ def test_files_of_a_folder_that_cannot_be_judged_are_left_out(tmp_path, monkeypa
 
     write_shard(tmp_path / "good.h5", [row()])
     (tmp_path / "gone.h5").symlink_to("nowhere")
+    (tmp_path / "ring.h5").symlink_to("ring.h5")
     os.mkfifo(tmp_path / "pipe.h5")
     write_shard(tmp_path / "late.h5", [row()])
     monkeypatch.setattr(sys.modules["lgrasp.judge.run"], "RowChecks", checks)
@@ -250,11 +251,11 @@ def test_files_of_a_folder_that_cannot_be_judged_are_left_out(tmp_path, monkeypa
     assert result.exit_code == 2
     assert "1 of 1 judged rows (100.00 %)" in result.stdout
     assert result.stderr.splitlines()[-1].startswith(
-        f"warning: 4 of 5 files are left out, first {tmp_path / 'gone.h5'}: no such file"
+        f"warning: 5 of 6 files are left out, first {tmp_path / 'gone.h5'}: no such file"
     )
     assert result.stderr.count("\n") == 1
     found = json.loads((tmp_path / "out.json").read_text())
-    assert (len(found["shards"]), len(found["left_out"])) == (1, 4)
+    assert (len(found["shards"]), len(found["left_out"])) == (1, 5)
     assert not judge(tmp_path).passed
     named = run(tmp_path, tmp_path / "text.h5")
     assert (named.exit_code, named.stdout) == (2, "")
@@ -263,6 +264,14 @@ def test_files_of_a_folder_that_cannot_be_judged_are_left_out(tmp_path, monkeypa
     none = run(tmp_path)
     assert (none.exit_code, none.stdout) == (2, "")
     assert none.stderr.startswith(f"error: {tmp_path / 'gone.h5'}: no such file")
+    write_shard(tmp_path / "late.h5", [row()])
+    with h5py.File(tmp_path / "late.h5", "r+") as file:
+        for name, column in [(name, column[:0]) for name, column in file["grasps"].items()]:
+            del file["grasps"][name]
+            file["grasps"][name] = column
+    none = run(tmp_path)
+    assert none.exit_code == 2
+    assert none.stderr.startswith(f"error: no row in {tmp_path / 'late.h5'}; {tmp_path / 'gone.h5'}: no such file")
 
 
 def test_damaged_string_heaps_are_found_before_they_are_read(tmp_path):

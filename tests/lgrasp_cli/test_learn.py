@@ -16,6 +16,9 @@ import lgrasp as lg
 from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.dataset.writer import write_shard
 from lgrasp.engine.cache import Cache
+from lgrasp.jobs.requests.shards import GraspRequest
+from lgrasp.learn.grasp.params import GraspParams
+from lgrasp.learn.grasp.solids import random_solids, solid_arrays
 from lgrasp.learn.network import CoarseNet
 from lgrasp.learn.networks import network_bytes
 from lgrasp.learn.params import LearnParams
@@ -55,6 +58,17 @@ def test_fit_and_eval(generate, cli):
     Path("bad.pt").write_bytes(b"nonsense")
     assert "not a network" in cli("learn", "eval", "bad.pt", "out").error()
     assert "absent.pt: no such file, nor a network" in cli("learn", "eval", "absent.pt", "out").error()
+
+
+def test_solids_of_an_interrupted_training_are_kept(generate, cli, monkeypatch):
+    assert generate(rows=64).code == 0
+    sizes = ["nodes=8", "channels=2", "completion_batch=4", "held_out=0", "shapes=1", "views=2", "cloud=64"]
+    options = [option for size in sizes for option in ("--set", f"grasp.{size}")]
+    monkeypatch.setattr(
+        JobProgress, "advanced", lambda self, part, n, note="", *_: setattr(self, "stop", "clouds" in note)
+    )
+    done = cli("learn", "fit", "--model", "grasp", "out", "--out", "net.pt", "--device", "cpu", *options)
+    assert (done.code, done.err) == (130, "interrupted: what was prepared is kept; the same command goes on\n")
 
 
 def test_interrupted_before_there_is_anything_to_report(generate, cli, monkeypatch):
@@ -113,6 +127,15 @@ def test_interrupted_trainings_go_on(generate, cli, monkeypatch, kept):
     assert shown[0]["curves"] == shown[1]["curves"]
     assert shown[0]["joint"] == shown[1]["joint"]
     assert [path.exists() for path in kept] == [False]
+
+
+def test_a_rebuilt_training_that_is_interrupted_says_what_goes_on(generate, cli, monkeypatch):
+    """With --rebuild the next run would begin again."""
+    assert generate(rows=20).code == 0
+    interrupted_at(3, monkeypatch)
+    asked = ["--steps", 10, "--joint-steps", 0, "--batch", 8, "--device", "cpu", "--set", "coarse.seed=7"]
+    done = cli("learn", "fit", "out", "--out", "net.pt", *asked, "--rebuild")
+    assert done.err == "interrupted: 3 steps are kept; the same command without --rebuild makes the rest\n"
 
 
 def test_bad_options(cli):
@@ -203,6 +226,23 @@ def test_networks_are_known_by_name(generate, cli, monkeypatch, tmp_path):
     assert "toy.pt is of hand 'allegro', the shards" in cli("learn", "eval", "toy", "out", "--device", "cpu").error()
     assert "did you mean 'toy'" in cli("learn", "eval", "toi", "out").error()
     assert loaded("from lgrasp.jobs.listing import list_networks; list_networks()", ["torch"]) == []
+
+
+def test_two_runs_that_make_solids_at_once(generate, tmp_path, monkeypatch):
+    """What one made while the other was at it is skipped there: each solid has its number's place."""
+    assert generate(rows=4).code == 0
+    monkeypatch.setattr("lgrasp.jobs.learn.grasp._SOLIDS", 2)
+    asked = GraspRequest(shards=(Path("out"),), params=GraspParams(shapes=6, cloud=64), device="cpu")
+    one, other = (asked.job(Cache(tmp_path / "cache")) for _ in range(2))
+    solids = list(random_solids(0, range(6), 64))
+
+    def told(done, note):
+        if note == "2 of 6 solids":
+            other.kept("solids 2", lambda: solid_arrays(solids[2:4]))
+
+    for job in (one, other):
+        for found, right in zip(job._solids(told), solids, strict=True):
+            assert np.array_equal(found.grid.values, right.grid.values)
 
 
 def test_grasps_are_planned_from_a_cloud_by_a_network(generate, cli):

@@ -5,7 +5,6 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -108,13 +107,19 @@ class GraspJob(GraspRequest, NetworkJob):
         missing = [number for name, numbers in parts.items() if name not in there for number in numbers]
         solids: list[SeenSolid] = []
         with closing(random_solids(p.seed, missing, p.cloud)) as makes:
+            numbered = zip(missing, makes, strict=True)
             for name, numbers in parts.items():
 
                 def make(numbers: range = numbers, damaged: bool = name in there) -> dict[str, np.ndarray]:
+                    own = zip(numbers, random_solids(p.seed, numbers, p.cloud), strict=True) if damaged else numbered
                     found = []
-                    for solid in random_solids(p.seed, numbers, p.cloud) if damaged else islice(makes, len(numbers)):
+                    for number, solid in own:
+                        if number < numbers.start:  # of a part that another run made meanwhile
+                            continue
                         found.append(solid)
-                        progress(0, f"{numbers.start + len(found):,} of {p.shapes:,} solids")
+                        progress(0, f"{number + 1:,} of {p.shapes:,} solids")
+                        if len(found) == len(numbers):
+                            break
                     return solid_arrays(found)
 
                 solids += solids_of(self.kept(name, make))

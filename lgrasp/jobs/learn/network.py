@@ -11,7 +11,7 @@ import numpy as np
 
 from lgrasp.dataset.gather import gather
 from lgrasp.engine.cache import content_key
-from lgrasp.engine.events import JobOutcome, Part
+from lgrasp.engine.events import JobOutcome, Part, PartProgress
 from lgrasp.engine.folder import Found
 from lgrasp.engine.run import Job
 from lgrasp.engine.shard_job import rows_digest
@@ -74,8 +74,12 @@ class FileJob(Job):
         """Whether an interrupted run made it."""
         return self.cache.has(_KEPT, self._kept_key(name))
 
-    def training(self, told: "Told") -> "Training":
-        """The training of the file, which goes on where an earlier run was interrupted."""
+    def training(self, progress: PartProgress, told: "Told | None" = None) -> "Training":
+        """The training of the file, which goes on where an earlier run was interrupted.
+
+        Args:
+            told: in place of ``progress``, where the part's rows are no steps.
+        """
         from lgrasp.learn.loop import Training
 
         def keep(phases: dict[str, bytes], steps: int) -> None:
@@ -85,7 +89,7 @@ class FileJob(Job):
         key = self._kept_key()
         kept = self.cache.load(_KEPT, key) or {}
         kept.pop(_STEPS, None)
-        return Training(told, {name: state.tobytes() for name, state in kept.items()}, keep)
+        return Training(told or progress, {k: state.tobytes() for k, state in kept.items()}, keep, progress.check)
 
     def kept_of(self, part: Part) -> int:
         kept = self.cache.load(_KEPT, self._kept_key())
@@ -93,7 +97,15 @@ class FileJob(Job):
 
     def _kept_key(self, name: str = "") -> str:
         kind = self.device_used.alias.partition(":")[0]
-        return content_key(_KEPT, 1, job=self.key(), torch=version("torch"), device=kind, name=name)
+        return content_key(_KEPT, 2, job=self._own_key, torch=version("torch"), device=kind, name=name)
+
+    @cached_property
+    def _own_key(self) -> str:
+        """The key, for which all that is learnt from is read."""
+        return self.key()
+
+    def has_prepared(self, part: Part) -> bool:
+        return any(map(self.has_kept, self.made_before()))
 
 
 class NetworkJob(FitRequest, FileJob):

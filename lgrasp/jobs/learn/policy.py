@@ -126,7 +126,7 @@ class PolicyJob(PolicyRequest, FileJob):
         yielding = int(train.contacts_yields.sum() + test.contacts_yields.sum())
         worth = _PROPOSALS / math.sqrt(yielding / (self.count * p.candidates))
         proposals = min(max(round(worth), LEAST_PROPOSALS), MOST_PROPOSALS)
-        training = self.training(lambda _, words, *, kept: progress(self.count - 1, words))
+        training = self.training(progress, lambda _, words, *, kept: progress(self.count - 1, words))
         by_reach, reach_curve = fit_network(train.reach, train.reach_yields, p, training, "reach")
         by_contacts, contacts_curve = fit_network(train.contacts, train.contacts_yields, p, training, "contacts")
         seconds["training"] = sum(training.seconds.values())
