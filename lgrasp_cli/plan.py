@@ -122,7 +122,8 @@ def _show_refined(data: dict[str, Any]) -> list[Block]:
         sums[one["hand"], one["object"]].update({name: one[name.replace(" ", "_")] for name in names[2:]})
     rows = [(*pair, *(f"{found[name]:,}" for name in names[2:])) for pair, found in sums.items()]
     points = all(one["points"] for one in data["results"])  # which no simulator takes
-    pairs = [closed(data), *ending(data, "rows", "render" if points else "simulate")]
+    following = "" if not any(entry["rows"] for entry in data["results"]) else "render" if points else "simulate"
+    pairs = [closed(data), *ending(data, "rows", following)]
     return [TextTable(names, rows, right=names[2:]), pairs]
 
 

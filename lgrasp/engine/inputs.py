@@ -37,7 +37,7 @@ from lgrasp.steer.field import steered_field
 from lgrasp.steer.params import NOTHING, Steering
 from lgrasp.steer.touch import find_touching
 
-OBJECT_VERSION = 5
+OBJECT_VERSION = 6
 """Raised whenever preprocessing gives other arrays."""
 
 Report = Callable[[str, float], None]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-FIELD_VERSION = 6
+FIELD_VERSION = 7
 """Raised whenever the arrays of a ContactField change meaning."""
 
 

@@ -15,7 +15,7 @@ from lgrasp.runtime.device import KERNEL_OPTIONS
 
 wp.set_module_options(KERNEL_OPTIONS)
 
-CLOSING_PLACES = wp.constant(3)
+CLOSING_PLACES = wp.constant(8)
 """Most places, in equal parts of the way, where fingers must be out of each other."""
 _STEP = wp.constant(0.15)  # [rad or m] of the joint that moves most: there is a place for each
 _PARTS = wp.constant(3)  # of the way on which penetration is measured

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from lgrasp.hand.piece import Piece
 from lgrasp.hand.tree import Tree
 
-HAND_VERSION = 20
+HAND_VERSION = 21
 """Raised whenever the arrays of a HandModel change meaning."""
 
 

@@ -4,6 +4,9 @@ from pydantic import Field
 
 from lgrasp.simulate.protocol import PositiveRange, Range, Ranges
 
+HOLD_VERSION = 8
+"""Raised whenever the same numbers give other results."""
+
 
 class HoldTest(Ranges):
     """How often each grasp is tried, and what is drawn for it; the first trial has the numbers of protocol fc."""

@@ -14,6 +14,8 @@ _CONE, _ANGLE = "steer.approach.direction", "steer.approach.angle"
 
 def config_difference(there: Mapping[str, Any], requested: Mapping[str, Any]) -> str:
     """``pipeline: swift there, robust requested`` of the configs of two shards; "" if they do not differ."""
+    if (version := requested.get("version")) and there.get("version") != version:
+        return "by another version of lgrasp"
     old, new = _values(there), _values(requested)
     common = old.keys() & new.keys()
     names = [name for name in new | old if (name in common or _is_optional(name)) and name not in NO_REASON]

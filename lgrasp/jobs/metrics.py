@@ -18,7 +18,7 @@ from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import OutputError, ShardError
 from lgrasp.grasp.bounds import GraspBounds, stages_told, stored_bounds
 from lgrasp.grasp.rows import METRIC_UNITS
-from lgrasp.hold.params import HoldTest
+from lgrasp.hold.params import HOLD_VERSION, HoldTest
 from lgrasp.jobs.difference import text_difference
 from lgrasp.jobs.requests.shards import MetricsRequest
 from lgrasp.jobs.shard_inputs import arrays_of_shard, object_of_shard
@@ -127,7 +127,7 @@ class MetricsJob(MetricsRequest, ShardJob):
 
     def _measured(self, bounds: GraspBounds, test: HoldTest) -> dict[str, str]:
         """With which numbers (JSON) each metric that is added is measured."""
-        numbers = {HOLD: test.model_dump(mode="json")}
+        numbers = {HOLD: test.model_dump(mode="json") | {"version": HOLD_VERSION}}
         return {name: json.dumps(numbers.get(name, {"friction": bounds.friction}), sort_keys=True) for name in self.add}
 
     def _names(self) -> list[str]:
@@ -154,7 +154,7 @@ class MetricsJob(MetricsRequest, ShardJob):
 def _measured_by_stage(reader: ShardReader) -> dict[str, str]:
     """The numbers (JSON) with which the pipeline of a shard tried its rows, if it did."""
     tried = stages_told(reader.header.config, HOLD)
-    return {HOLD: json.dumps({k: x for k, x in tried[0].items() if k != "version"}, sort_keys=True)} if tried else {}
+    return {HOLD: json.dumps(tried[0], sort_keys=True)} if tried else {}
 
 
 def _differences(there: Mapping[str, str], asked: Mapping[str, str]) -> Iterator[tuple[str, str]]:

@@ -49,7 +49,8 @@ class ReachJob(ReachRequest, VerdictJob):
     def settings(self) -> dict[str, Any]:
         arm = self.described
         where = {name: getattr(self, name).model_dump(mode="json") for name in ("mount", "at")}
-        return {"arm": arm.urdf.name, "arm_sha256": arm.sha256, "tip": arm.tip} | where | {"tries": self.tries}
+        told = {"arm": arm.urdf.name, "arm_sha256": arm.sha256, "tip": arm.tip, "version": self.version}
+        return told | where | {"tries": self.tries}
 
     def parts(self) -> list[Part]:
         self.settings()  # an arm that cannot be used is told before shards are read

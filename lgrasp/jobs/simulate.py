@@ -29,7 +29,14 @@ from lgrasp.runtime.kept import Keeper
 from lgrasp.simulate.engines import SOLVERS
 from lgrasp.simulate.lift import check_liftable
 from lgrasp.simulate.protocol import NO_TABLE, Protocol
-from lgrasp.simulate.run import check_installed, load_world_kernels, on_cpu, protocol_text, verdicts
+from lgrasp.simulate.run import (
+    VERDICT_VERSION,
+    check_installed,
+    load_world_kernels,
+    on_cpu,
+    protocol_text,
+    verdicts,
+)
 from lgrasp.simulate.scene import Scene, scene_of
 from lgrasp.simulate.solid import Solid
 from lgrasp.simulate.verdict import COLUMNS, DRAWN_COLUMNS, LIFT_COLUMNS, OBJECT_COLUMNS
@@ -45,7 +52,7 @@ class SimulateJob(SimulateRequest, VerdictJob):
     """Adds verdicts of a physics simulation to shards, in place or to copies."""
 
     command: ClassVar[str] = "simulate"
-    version: ClassVar[int] = 8
+    version: ClassVar[int] = VERDICT_VERSION
 
     _said: set[str] = PrivateAttr(default_factory=set)
     _kept: Keeper = PrivateAttr(default_factory=Keeper)
@@ -56,7 +63,8 @@ class SimulateJob(SimulateRequest, VerdictJob):
 
     def settings(self) -> dict[str, Any]:
         described = self.protocol.model_dump(mode="json")
-        return described | SOLVERS[self.protocol.engine] | {"all_directions": self._all, "device": self._kind()}
+        told = {"all_directions": self._all, "device": self._kind(), "version": self.version}
+        return described | SOLVERS[self.protocol.engine] | told
 
     @property
     def _all(self) -> bool:

@@ -19,7 +19,7 @@ class VerdictJob(VerdictRequest, ShardJob):
     """Adds verdicts to shards, in place or to copies."""
 
     version: ClassVar[int]
-    """Raised whenever the same settings give other verdicts."""
+    """Raised whenever the same settings give other verdicts; among the settings."""
 
     @property
     @abstractmethod

@@ -192,6 +192,8 @@ class Training:
         if phase not in self._phases:
             return 0
         state = torch.load(io.BytesIO(self._phases[phase]), map_location="cpu", weights_only=True)
+        if state["parts"].keys() != parts.keys():  # of a version that kept something else
+            return 0
         for name, part in parts.items():
             if isinstance(part, torch.Generator):
                 part.set_state(state["parts"][name])

@@ -29,6 +29,10 @@ from lgrasp.simulate.verdict import Verdict, chunk_of, stack_verdicts
 _BY_SLOT = ("object_pose", "object_index", "contact_points", "contact_normals", "contact_links", "contact_forces")
 
 
+VERDICT_VERSION = 8
+"""Raised whenever the same protocol gives other verdicts."""
+
+
 class Group(NamedTuple):
     """Rows that have the same objects, whatever their slots."""
 
@@ -323,6 +327,7 @@ def protocol_text(scene: Scene, protocol: Protocol, *, all_directions: bool = Fa
         all_directions=all_directions,
         ends_early=True,
         chunk=chunk_of(protocol),
+        version=VERDICT_VERSION,
         objects=objects,
         **SOLVERS[protocol.engine],
     )

@@ -14,7 +14,7 @@ from lgrasp.engine.events import Events, JobOutcome
 from lgrasp.engine.pipeline import load_pipeline
 from lgrasp.engine.run import run as generate
 from lgrasp.engine.run import run as run_job
-from lgrasp.errors import ConfigError, ShardError
+from lgrasp.errors import ConfigError, OutputError, ShardError
 from lgrasp.grasp.records import GraspRows
 from lgrasp.hold.run import METRICS
 from lgrasp.jobs.generate import GenerateJob
@@ -106,3 +106,11 @@ def test_what_cannot_be_tried(tried, add, tmp_path):
         add(tmp_path / "two.h5", tmp_path / "out")
     with pytest.raises(ConfigError, match=r"hold\.drawz"):
         add(tried, tmp_path / "out", settings=("hold.drawz=2",))
+
+
+def test_copies_of_another_version_are_not_taken(tried, add, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("lgrasp.jobs.metrics.HOLD_VERSION", 0)
+        add(tried, tmp_path / "out")
+    with pytest.raises(OutputError, match=r"has hold measured with other numbers \(by another version of lgrasp\)"):
+        add(tried, tmp_path / "out")

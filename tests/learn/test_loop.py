@@ -1,5 +1,6 @@
 """The loop of trainings: one that is interrupted anywhere ends with the same bits."""
 
+import io
 from contextlib import suppress
 
 import numpy as np
@@ -82,6 +83,22 @@ def test_what_is_told(monkeypatch):
     monkeypatch.setattr(loop, "_KEEP", 0.0)
     train(Training(keep=lambda p, n: kept.append(n)))
     assert kept == list(range(1, 20))
+
+
+def test_a_state_of_other_parts_is_not_gone_on_with():
+    """Such as another version kept."""
+    kept: dict[str, bytes] = {}
+    train(Training(None, None, lambda phases, steps: kept.update(phases)))
+    for phase in kept:
+        state = torch.load(io.BytesIO(kept[phase]), weights_only=True)
+        state["parts"]["something"] = state["parts"].pop("gradient_step")
+        packed = io.BytesIO()
+        torch.save(state, packed)
+        kept[phase] = packed.getvalue()
+    net, _ = train(again := Training(None, kept))
+    assert again.resumed == 0
+    for a, b in zip(net.parameters(), train(Training())[0].parameters(), strict=True):
+        assert torch.equal(a, b)
 
 
 def test_a_training_that_diverges_says_so():

@@ -139,6 +139,18 @@ def test_joints_outside_their_limits_are_clamped(cli, shards, tmp_path):
     assert shard.grasps.q[3, 2] == pytest.approx(shard.hand.joint_upper[2], abs=0.05)
 
 
+def test_no_row_that_passes(cli, shards, tmp_path):
+    """The files are there and hold nothing, which a script is told."""
+    folder, out = spoilt(shards, tmp_path / "spoilt"), tmp_path / "refined"
+    with h5py.File(folder / "allegro-tiny-00000.h5", "r+") as file:
+        file["grasps/object_pose"][..., 0] += 3.0
+    for _ in range(2):
+        found = cli("refine", folder, "--out", out, "--matching-rounds", 1, "--device", "cpu")
+        assert found.code == 3
+        assert found.err.endswith(f"error: none of the rows passed the checks; the files in {out} hold no grasps\n")
+        assert "next" not in found.out
+
+
 def test_hands_that_are_far_off_are_told(cli, shards, tmp_path):
     folder, out = spoilt(shards, tmp_path / "spoilt", object_pose=put(3.0, 0)), tmp_path / "refined"
     found = cli("refine", folder, "--out", out, "--matching-rounds", 1, "--device", "cpu", "-q")

@@ -83,6 +83,18 @@ def test_verdicts_that_are_replaced_go_as_a_whole(cli, grasps, tmp_path):
     assert "mine_share" not in physics
 
 
+def test_verdicts_of_another_version_are_not_taken(cli, grasps, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(simulate.SimulateJob, "version", 7)
+        patch.setattr(sys.modules["lgrasp.simulate.run"], "VERDICT_VERSION", 7)
+        assert cli("simulate", grasps).code == 0
+        assert cli("simulate", grasps).code == 0
+    line = cli("simulate", grasps).error()
+    assert "has other verdicts of fc (by another version of lgrasp); --overwrite replaces them" in line
+    assert cli("simulate", grasps, "--overwrite").code == 0
+    assert json.loads(cli("simulate", grasps, "--json", "-").out)["made"] == 0
+
+
 def test_objects_of_one_name_are_told_apart(cli, grasps, tmp_path):
     """A mug of another size has another mass."""
     (path, _) = sorted(grasps.glob("*.h5"))

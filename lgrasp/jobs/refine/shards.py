@@ -22,7 +22,7 @@ from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
 from lgrasp.engine.run import Job
 from lgrasp.engine.shard_job import ShardJob
-from lgrasp.errors import HandError, ShardError
+from lgrasp.errors import HandError, LgraspError, ShardError, StarvedError
 from lgrasp.grasp.bounds import stored_bounds
 from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader, now
 from lgrasp.hand.arrays import HandArrays
@@ -166,6 +166,11 @@ class RefineJob(RefineRequest, ShardJob):
         """``results``: of each shard hand, object, ``points`` (it is a cloud), rows, refined, valid before and after,
         mean energies, seconds; ``force_closure`` (share)."""
         return {"results": [_entry(path) for path in outcome.paths], "force_closure": closure_share(outcome.paths)}
+
+    def shortfall(self, outcome: JobOutcome) -> LgraspError | None:
+        if outcome.rows or not outcome.paths:
+            return None
+        return StarvedError(f"none of the rows passed the checks; the files in {self.out} hold no grasps")
 
     @cached_property
     def _named(self) -> tuple[HandSource, HandModel]:

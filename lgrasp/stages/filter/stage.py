@@ -23,7 +23,7 @@ from lgrasp.stages.filter.posture_kernels import (
     tell_postures,
 )
 
-VERSION = 22
+VERSION = 23
 
 
 def run(inputs: ContactSets, params: FilterParams, context: Context) -> tuple[GraspTable, Tally]:

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from lgrasp.grasp.tables import GraspTable, take_grasps
+from lgrasp.hold.params import HOLD_VERSION
 from lgrasp.hold.run import ControlPoses, HoldTester
 from lgrasp.seeding import stage_seed
 from lgrasp.stages.context import Context
 from lgrasp.stages.hold.params import HoldParams
 
-VERSION = 8
+VERSION = HOLD_VERSION
 
 
 def run(inputs: GraspTable, params: HoldParams, context: Context) -> tuple[GraspTable, dict[str, int]]:

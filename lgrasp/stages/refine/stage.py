@@ -16,7 +16,7 @@ from lgrasp.stages.context import Context
 from lgrasp.stages.refine.params import RefineParams
 from lgrasp.steer.demands import Demands
 
-VERSION = 9
+VERSION = 10
 
 
 def run(inputs: GraspTable, params: RefineParams, context: Context) -> tuple[GraspTable, dict[str, int]]:
