@@ -139,6 +139,26 @@ def test_joints_outside_their_limits_are_clamped(cli, shards, tmp_path):
     assert shard.grasps.q[3, 2] == pytest.approx(shard.hand.joint_upper[2], abs=0.05)
 
 
+def test_control_poses_of_another_version_are_made_again(cli, shards, tmp_path):
+    """It may have opened hands that pass each other as they close; joints and pose of valid rows stay."""
+    (source,) = shards.glob("*.h5")
+    shard = read_shard(source)
+    config = json.loads(json.dumps(shard.header.config))
+    (filtered,) = (stage["filter"] for stage in config["pipeline"]["stages"] if "filter" in stage)
+    opened = shard.grasps.q_pregrasp.copy()
+    opened[:, 2] += 1e-3
+    for version in (filtered["version"], 1):
+        filtered["version"] = version
+        rows, out = replace(shard.grasps, q_pregrasp=opened), tmp_path / f"refined{version}"
+        write_shard(source, replace(shard, header=replace(shard.header, config=config), grasps=rows))
+        assert cli("refine", shards, "--out", out, "--matching-rounds", 1, "--device", "cpu").code == 0
+        after = read_shard(out / source.name).grasps
+        stay = after.metrics["refined"] == 0
+        assert stay.any()
+        np.testing.assert_array_equal(after.q[stay], shard.grasps.q[stay])
+        assert (after.q_pregrasp[stay] == opened[stay]).all() == (version != 1)
+
+
 def test_no_row_that_passes(cli, shards, tmp_path):
     """The files are there and hold nothing, which a script is told."""
     folder, out = spoilt(shards, tmp_path / "spoilt"), tmp_path / "refined"

@@ -20,10 +20,11 @@ from lgrasp.dataset.reader import ShardReader, read_shard
 from lgrasp.engine.cache import content_key
 from lgrasp.engine.events import JobOutcome, Made, Part, PartProgress
 from lgrasp.engine.folder import shard_path
+from lgrasp.engine.registry import STAGES
 from lgrasp.engine.run import Job
 from lgrasp.engine.shard_job import ShardJob
 from lgrasp.errors import HandError, LgraspError, ShardError, StarvedError
-from lgrasp.grasp.bounds import stored_bounds
+from lgrasp.grasp.bounds import stages_told, stored_bounds
 from lgrasp.grasp.records import ObjectRecord, Shard, ShardHeader, now
 from lgrasp.hand.arrays import HandArrays
 from lgrasp.hand.find import HandSource
@@ -118,6 +119,8 @@ class RefineJob(RefineRequest, ShardJob):
         asked, left, config = _asked(part.source, shard, hand, model)
         told = stored_bounds(config, part.source)
         bounds, params = self.numbers(told)
+        same = told.model_copy(update={"min_hold_probability": 0.0, "profile": bounds.profile}) == bounds
+        by_us = all(made.get("version") == STAGES["filter"].version for made in stages_told(config, "filter"))
         begin = time.perf_counter()
         moved = move_rows(
             hand,
@@ -129,7 +132,7 @@ class RefineJob(RefineRequest, ShardJob):
             planes=shard.objects[0].tables if shard.grasps.table else None,
             keep_invalid=self.keep_invalid,
             stored=self.form is None,
-            measured=told.model_copy(update={"min_hold_probability": 0.0, "profile": bounds.profile}) == bounds,
+            measured=same and by_us,
             progress=progress,
         )
         if moved.clamped:
