@@ -275,10 +275,10 @@ def parse_model(model: type[Model], data: Any, where: str) -> Model:
             raise ConfigError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
         value = repr(str(first["input"]) if isinstance(first["input"], Path) else first["input"])
         shown = value if len(value) <= 100 else f"{value[:97]}..."
-        raise ConfigError(f"{where}: key '{key}' = {shown}: {_reason(first)}") from None
+        raise ConfigError(f"{where}: key '{key}' = {shown}: {plain_reason(first)}") from None
 
 
-def _reason(problem: Any) -> str:
+def plain_reason(problem: Any) -> str:
     """What a pydantic error says, in the words of YAML."""
     kind, given = problem["type"], problem["input"]
     if kind in ("tuple_type", "list_type"):
@@ -320,7 +320,8 @@ def apply_settings(parts: Mapping[str, BaseModel], settings: Sequence[str], wher
         known = {f"{p}.{k}" for p, model in parts.items() for k in type(model).model_fields}
         if part not in parts or key not in type(parts[part]).model_fields:
             keys = [k for k in sorted(known) if k.startswith(f"{part}.")] or sorted(parts)
-            hint = did_you_mean(name.strip(), sorted(known), cutoff=0.4)
+            elsewhere = [k for k in sorted(known) if k.endswith(f".{key}")]
+            hint = did_you_mean(name.strip(), elsewhere or sorted(known), cutoff=0.0 if elsewhere else 0.4)
             raise ConfigError(f"--set '{text}': {where} has no '{name.strip()}'; {hint}known: {', '.join(keys)}")
         try:
             changes.setdefault(part, {})[key] = load_yaml(value)

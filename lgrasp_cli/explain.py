@@ -17,7 +17,7 @@ def explain(error: BaseException) -> tuple[str, int]:
     if type(error).__name__ == "NoArgsIsHelpError":  # no command: its message, the help, is printed already
         return "", 2
     if isinstance(error, typer.TyperException):
-        return f"error: {error.format_message()}{_extra_word(error)}", error.exit_code
+        return f"error: {_message(error)}{_extra_word(error)}", error.exit_code
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return "interrupted", 130
     if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):  # nobody reads
@@ -49,6 +49,21 @@ def _has_folder() -> bool:
         return bool(os.getcwd())
     except OSError:
         return False
+
+
+def _message(error: typer.TyperException) -> str:
+    """What typer says, with the value that was given."""
+    message, cause = error.format_message(), error.__cause__
+    if cause is None:
+        return message
+    from pydantic import ValidationError
+
+    from lgrasp.config import plain_reason
+
+    if not isinstance(cause, ValidationError):
+        return message
+    (first, *_) = cause.errors()
+    return message.replace(error.message, f"{first['input']}: {plain_reason(first)}")
 
 
 def _extra_word(error: typer.TyperException) -> str:
