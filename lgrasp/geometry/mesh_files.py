@@ -22,7 +22,8 @@ def check_whole(kind: str, data: bytes) -> None:
         faces = int.from_bytes(data[80:84], "little")
         if len(data) != 84 + 50 * faces:
             raise ValueError(
-                f"no whole STL: {len(data):,} bytes; {84 + 50 * faces:,} are accepted of a binary one of its faces"
+                f"no whole STL: {len(data):,} bytes; of a binary one with {faces:,} faces, "
+                f"{84 + 50 * faces:,} are accepted"
             )
 
 
